@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 from loopwright.tuning.analysis.stability import is_stable
 from loopwright.tuning.fast.gain_bounds import does_not_encircle, largest_gains
 from loopwright.tuning.fast.iae import Cost, LoopCost
-from loopwright.tuning.fast.weight_bounds import KEPT, Bounds, Missed, weights
+from loopwright.tuning.fast.weight_bounds import KEPT, DesignBounds, Missed, weights
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Complexes, Model, Reals, TransferFunction, sign
 from loopwright.tuning.reasons import Reason, Refused
@@ -54,8 +54,8 @@ controller's object dictionary limits b neither way."""
 MAX_OVERSHOOT = 0.01
 """Largest overshoot of the aim no_overshoot on the model, as a fraction of the set-point step."""
 WIDER_OVERSHOOTS, MAX_PRICE = (0.02, 0.05), 1.5
-"""Bounds on the overshoot that follow where one raises J by more than the factor MAX_PRICE."""
-MAX_WORTH = 1.2
+"""DesignBounds on the overshoot that follow where one raises J by more than the factor MAX_PRICE."""
+MAX_COST_RATIO = 1.2
 """Factor by which a settling time may raise J beyond that of the best gains for the same Ms. More of it is bought with
 an integral time so long that PV reaches the band by b*Kp alone, and loads are corrected ten times as slowly."""
 MAX_SETTLING_S, MAX_MV_PEAK = 1e8, 1e9
@@ -199,9 +199,9 @@ class GainDesign:
         self.tail = np.geomspace(start, TAIL_FACTOR * end, POINTS)
         self.G_tail = positive.frequency_response(self.tail)
         self.minimum: Cost | None = None
-        self.bounds = Bounds(spec.Ms)
+        self.bounds = DesignBounds(spec.Ms)
         """The bounds that are in effect."""
-        self.worth: OptimalGains | None = None
+        self.without_time: OptimalGains | None = None
         """The gains that others are measured by, see `best_within`."""
 
     def best(self) -> OptimalGains:
@@ -216,29 +216,30 @@ class GainDesign:
             return self._best()
         free = self._best()
         for overshoot in (self.spec.aim.max_overshoot, *WIDER_OVERSHOOTS):
-            self.bounds, self.minimum = Bounds(self.spec.Ms, overshoot), None
+            self.bounds, self.minimum = DesignBounds(self.spec.Ms, overshoot), None
             try:
                 held = self._best()
             except Refused:  # not one PI keeps it
                 continue
             if self._J(held.cost, free.minimum) <= MAX_PRICE * free.J:
                 return held
-        self.bounds, self.minimum = Bounds(self.spec.Ms), free.minimum
+        self.bounds, self.minimum = DesignBounds(self.spec.Ms), free.minimum
         return free
 
-    def best_within(self, bounds: Bounds, worth: OptimalGains | None = None) -> OptimalGains:
+    def best_within(self, bounds: DesignBounds, without_time: OptimalGains | None = None) -> OptimalGains:
         """The best PI or PID under these bounds in place of those of the specification; where none keeps the settling
         time and the movement of MV, those that miss them least.
 
-        worth: the best gains without the settling time; gains with more than MAX_WORTH times their J are left out.
+        without_time: the best gains without the settling time; gains with more than MAX_COST_RATIO times their J are
+        left out.
         Raises Refused, NOT_ROBUST.
         """
-        self.bounds, self.worth = bounds, worth
-        self.minimum = None if worth is None else worth.minimum
+        self.bounds, self.without_time = bounds, without_time
+        self.minimum = None if without_time is None else without_time.minimum
         try:
             return self._best()
         finally:
-            self.bounds, self.worth = Bounds(self.spec.Ms), None
+            self.bounds, self.without_time = DesignBounds(self.spec.Ms), None
 
     def J(self, best: OptimalGains, minimum: Cost) -> float:
         """J of these gains over other smallest IAE."""
@@ -248,7 +249,7 @@ class GainDesign:
         try:
             pi = self._pi()
         except Refused:
-            pid = self._pid() if self.spec.derivative and self.worth is not None else None
+            pid = self._pid() if self.spec.derivative and self.without_time is not None else None
             if pid is None:
                 raise
             return pid
@@ -280,14 +281,15 @@ class GainDesign:
                 responses = self.cost.responses(end, Ti, Td, spec.N)
                 for b, missed in weights(responses, spec.weights, bounds):
                     cost = responses.cost(b)
-                    if self._is_worth(cost):
+                    if self._is_cheap_enough(cost):
                         gains = Gains(float(end), float(Ti), float(Td), float(Td) / spec.N, b)
                         found.append((gains, cost, missed))
                         break
         return found
 
-    def _is_worth(self, cost: Cost) -> bool:
-        return self.worth is None or self._J(cost, self.worth.minimum) <= MAX_WORTH * self.worth.J
+    def _is_cheap_enough(self, cost: Cost) -> bool:
+        best = self.without_time
+        return best is None or self._J(cost, best.minimum) <= MAX_COST_RATIO * best.J
 
     def _pi(self) -> OptimalGains:
         scanned = [self._candidates(Ti * self.period) for Ti in TI]
@@ -355,7 +357,7 @@ class GainDesign:
     def _lower_minimum(self, found: list[_Candidate]) -> None:
         """Makes the minimum the smallest IAE of all that was found so far, each alone. Gains that miss a requirement
         count where none keeps it."""
-        if self.worth is not None:
+        if self.without_time is not None:
             return
         kept = [each for each in found if each[2] == KEPT]
         costs = [cost for _, cost, _ in kept or found] + ([] if self.minimum is None else [self.minimum])

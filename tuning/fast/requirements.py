@@ -6,7 +6,7 @@ So the gains are those for the smallest Ms that permits the time, never above th
 "in five minutes, not faster": of the gains from robust to fast, the most robust that are in time.
 
     smallest Ms' from 1.1 to Ms for which gains under Ms' (and Mt, the noise gain, the overshoot, the movement of MV)
-    settle in time and have a J of at most MAX_WORTH times the smallest J under the same bounds without the time
+    settle in time and have a J of at most MAX_COST_RATIO times the smallest J under the same bounds without the time
 
 and of these gains those with the smallest J. A movement of MV bounds Kp and b together. Without a settling time the
 gains are those with the smallest J that keep it, of the largest gains under any Ms from 1.1 to the one asked for: with
@@ -26,7 +26,7 @@ import numpy as np
 from loopwright.tuning.analysis.comparison import BAND, loop_performance
 from loopwright.tuning.fast.design import MAX_PRICE, WIDER_OVERSHOOTS, GainDesign, OptimalGains
 from loopwright.tuning.fast.iae import Cost
-from loopwright.tuning.fast.weight_bounds import KEPT, Bounds, Missed
+from loopwright.tuning.fast.weight_bounds import KEPT, DesignBounds, Missed
 from loopwright.tuning.models import Model, integrators
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -76,7 +76,7 @@ def required(design: GainDesign) -> OptimalGains:
 def keeping(design: GainDesign) -> OptimalGains | None:
     """The same; None where no gains keep the requirements. Raises Refused, NOT_ROBUST.
 
-    Where no gains with a derivative do, those without may: MAX_WORTH is then measured by the best of these.
+    Where no gains with a derivative do, those without may: MAX_COST_RATIO is then measured by the best of these.
     """
     spec = design.spec
     if not spec.has_requirements:
@@ -95,9 +95,9 @@ def _keeping(design: GainDesign) -> OptimalGains | None:
         return None
     overshoots = (None,) if spec.aim.max_overshoot is None else (spec.aim.max_overshoot, *WIDER_OVERSHOOTS, None)
     for overshoot in overshoots:
-        search = _Search(design, Bounds(spec.Ms, overshoot, spec.settling_s, spec.mv_peak))
+        search = _RequirementSearch(design, DesignBounds(spec.Ms, overshoot, spec.settling_s, spec.mv_peak))
         found = search.found()
-        if found is not None and (overshoot is None or _worth(design, search, found)):
+        if found is not None and (overshoot is None or _overshoot_costs_little(design, search, found)):
             return found.best
     if search.nearest is None:
         raise Refused(Reason.NOT_ROBUST, f"no gains on the model have an Ms of at most {spec.Ms:g}")
@@ -111,18 +111,18 @@ def possible_instead(design: GainDesign) -> str:
     if spec.derivative:  # the answer for gains without one: its search is exact, and it holds for both
         return possible_instead(_without_derivative(design))
     if spec.mv_peak is not None:
-        least = _possible(design, Bounds(spec.Ms, mv_peak=max(spec.mv_peak, _final_change(design.model))))
-        if least.mv_peak is None or least.mv_peak > spec.mv_peak * NEARLY:
-            return _instead_of_peak(design, spec.mv_peak, least.mv_peak)
+        smallest = _possible(design, DesignBounds(spec.Ms, mv_peak=max(spec.mv_peak, _final_change(design.model))))
+        if smallest.mv_peak is None or smallest.mv_peak > spec.mv_peak * NEARLY:
+            return _instead_of_peak(design, spec.mv_peak, smallest.mv_peak)
     assert spec.settling_s is not None
-    fastest = _possible(design, Bounds(spec.Ms, settling_s=spec.settling_s, mv_peak=spec.mv_peak)).settling_s
+    fastest = _possible(design, DesignBounds(spec.Ms, settling_s=spec.settling_s, mv_peak=spec.mv_peak)).settling_s
     return _instead_of_time(design, spec.settling_s, fastest)
 
 
-def _possible(design: GainDesign, bounds: Bounds) -> Bounds:
+def _possible(design: GainDesign, bounds: DesignBounds) -> DesignBounds:
     """The bounds with the requirement that is missed the most replaced by the least that is possible, None where no
     gains keep it at all. Raises Refused, NOT_ROBUST."""
-    search = _Search(design, bounds)
+    search = _RequirementSearch(design, bounds)
     if search.found() is not None:
         return bounds
     if search.nearest is None:
@@ -131,7 +131,7 @@ def _possible(design: GainDesign, bounds: Bounds) -> Bounds:
     past = missed.mv_peak or missed.settling
     without = replace(bounds, mv_peak=None) if missed.mv_peak else replace(bounds, settling_s=None)
 
-    def moved(factor: float) -> Bounds:
+    def moved(factor: float) -> DesignBounds:
         def to(value: float | None) -> float | None:
             return None if value is None else _up(value * (1.0 + past) * factor)
 
@@ -142,24 +142,24 @@ def _possible(design: GainDesign, bounds: Bounds) -> Bounds:
     if not math.isfinite(past):
         return without
     for factor in MORE:
-        if _Search(design, moved(factor)).found() is not None:
+        if _RequirementSearch(design, moved(factor)).found() is not None:
             return moved(factor)
     return without
 
 
-def _worth(design: GainDesign, search: _Search, found: _Found) -> bool:
+def _overshoot_costs_little(design: GainDesign, search: _RequirementSearch, found: _Found) -> bool:
     """Whether a bound on the overshoot raises J by at most MAX_PRICE; where a settling time is asked for, J is not what
     decides."""
     if search.bounds.settling_s is not None:
         return True
-    free = _Search(design, replace(search.bounds, overshoot=None)).at(found.best.Ms)
+    free = _RequirementSearch(design, replace(search.bounds, overshoot=None)).at(found.best.Ms)
     return free is None or design.J(found.best, free.best.minimum) <= MAX_PRICE * free.best.J
 
 
-class _Search:
+class _RequirementSearch:
     """The search over Ms. bounds: those asked for."""
 
-    def __init__(self, design: GainDesign, bounds: Bounds) -> None:
+    def __init__(self, design: GainDesign, bounds: DesignBounds) -> None:
         self.design, self.bounds = design, bounds
         self.nearest: _Found | None = None
 
@@ -237,13 +237,13 @@ class _Search:
             return free
         return self._exact(bounds, free.best)
 
-    def _exact(self, bounds: Bounds, worth: OptimalGains | None = None) -> _Found | None:
+    def _exact(self, bounds: DesignBounds, without_time: OptimalGains | None = None) -> _Found | None:
         """The gains that keep these bounds by the exact response too; None where there are none."""
         found: _Found | None = None
         tight = bounds
         for _ in range(TIGHTENINGS):
             try:
-                best = self.design.best_within(tight, worth)
+                best = self.design.best_within(tight, without_time)
             except Refused:
                 return found
             missed = self._missed(best, bounds.settling_s is not None)
@@ -279,17 +279,17 @@ def _final_change(model: Model) -> float:
     return 0.0 if integrators(model) else 1.0 / abs(model.static_gain)
 
 
-def _instead_of_peak(design: GainDesign, asked: float, least: float | None) -> str:
+def _instead_of_peak(design: GainDesign, asked: float, smallest: float | None) -> str:
     """What is possible in place of the movement of MV."""
-    if least is None:
+    if smallest is None:
         return f"no gains with an Ms of at most {design.spec.Ms:g} move MV by no more than {asked:g} for each PV unit"
     text = (
-        f"after a set-point step MV has to move by at least {least:g} for each PV unit on this loop, and {asked:g} was "
+        f"after a set-point step MV has to move by at least {smallest:g} for each PV unit on this loop, and {asked:g} was "
         "asked for"
     )
     if final := _final_change(design.model):
         text += f"; in the end it has moved by {final:.3g}, one over the plant's gain"
-    return f"{text}: permit at least {least:g}"
+    return f"{text}: permit at least {smallest:g}"
 
 
 def _instead_of_time(design: GainDesign, asked: float, fastest: float | None) -> str:
@@ -312,20 +312,20 @@ def _instead_of_time(design: GainDesign, asked: float, fastest: float | None) ->
 def _others(design: GainDesign) -> Iterator[str]:
     """What else would permit the settling time."""
     spec = design.spec
-    search = _Search(design, Bounds(spec.Ms, settling_s=spec.settling_s, mv_peak=spec.mv_peak))
+    search = _RequirementSearch(design, DesignBounds(spec.Ms, settling_s=spec.settling_s, mv_peak=spec.mv_peak))
     if (Ms := _sufficient_Ms(search)) is not None:
         yield f"for Ms {Ms:g}"
     if spec.mv_peak is not None:
-        free = _Search(design, replace(search.bounds, mv_peak=None)).at(spec.Ms)
+        free = _RequirementSearch(design, replace(search.bounds, mv_peak=None)).at(spec.Ms)
         if free is not None and free.kept:
             reached = loop_performance(design.model, free.best.gains).setpoint
             assert reached is not None
             peak = _up(reached.mv_peak)
-            if _Search(design, replace(search.bounds, mv_peak=peak)).found() is not None:
+            if _RequirementSearch(design, replace(search.bounds, mv_peak=peak)).found() is not None:
                 yield f"for a movement of MV of {peak:g}"
 
 
-def _sufficient_Ms(search: _Search) -> float | None:
+def _sufficient_Ms(search: _RequirementSearch) -> float | None:
     """The smallest multiple of MS_STEP, up to HIGHEST_MS, that permits the settling time; None for none."""
 
     def permits(steps: int) -> bool:

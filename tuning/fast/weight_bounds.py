@@ -52,7 +52,7 @@ KEPT = Missed()
 
 
 @dataclass(frozen=True, slots=True)
-class Bounds:
+class DesignBounds:
     """The bounds of a design on its gains and on the answer to a set-point step; None is no bound.
 
     Ms: the largest permitted maximum sensitivity.
@@ -67,7 +67,9 @@ class Bounds:
     mv_peak: float | None = None
 
 
-def weights(responses: LoopResponses, limits: tuple[float, float], bounds: Bounds) -> Iterator[tuple[float, Missed]]:
+def weights(
+    responses: LoopResponses, limits: tuple[float, float], bounds: DesignBounds
+) -> Iterator[tuple[float, Missed]]:
     """The set-point weight with the least IAE after a set-point step of those that keep the bounds. Where there is
     none, the one that misses them least, and then the one with the least IAE, each with by how much it misses them.
     There is none at all where no weight keeps the overshoot.
@@ -82,25 +84,25 @@ def weights(responses: LoopResponses, limits: tuple[float, float], bounds: Bound
         u, by = movement(responses)
         lower, upper = _within(u, -by, bounds.mv_peak)
         if max(low, lower) > min(high, upper):
-            best = 1.0 - responses.least(low, high)
-            for x in (_least_peak(u, by, low, high), best):
+            best = 1.0 - responses.best_weight(low, high)
+            for x in (_smallest_peak(u, by, low, high), best):
                 yield 1.0 - x, Missed(mv_peak=float(np.abs(u - x * by).max()) / bounds.mv_peak - 1.0)
             return
         low, high = max(low, lower), min(high, upper)
     if bounds.settling_s is None:
-        yield responses.least(low, high), KEPT
+        yield responses.best_weight(low, high), KEPT
         return
     from_low, to_high = _from_each_time_on(responses, low, high)
     asked = math.ceil(bounds.settling_s / responses.h - 1e-9)  # the first time that has to be within the band
     if asked >= len(from_low):  # the response has died away before
-        yield responses.least(low, high), KEPT
+        yield responses.best_weight(low, high), KEPT
         return
     if from_low[asked] <= to_high[asked]:
-        yield responses.least(float(from_low[asked]), float(to_high[asked])), KEPT
+        yield responses.best_weight(float(from_low[asked]), float(to_high[asked])), KEPT
         return
-    best = 1.0 - responses.least(low, high)
+    best = 1.0 - responses.best_weight(low, high)
     if (fastest := _first(from_low <= to_high)) < len(from_low):
-        quick = responses.least(float(from_low[fastest]), float(to_high[fastest]))
+        quick = responses.best_weight(float(from_low[fastest]), float(to_high[fastest]))
         yield quick, Missed(settling=fastest * responses.h / bounds.settling_s - 1.0)
     settled = _first((from_low <= best) & (best <= to_high))
     yield 1.0 - best, Missed(settling=settled * responses.h / bounds.settling_s - 1.0)
@@ -161,7 +163,7 @@ def _ends(a: Reals, by: Reals, maximum: float) -> tuple[Reals, Reals]:
     return np.where(moved, ends[0], fixed), np.where(moved, ends[1], -fixed)
 
 
-def _least_peak(u: Reals, by: Reals, low: float, high: float) -> float:
+def _smallest_peak(u: Reals, by: Reals, low: float, high: float) -> float:
     """The x from low to high with the least largest |u - x*by|, which is convex in x."""
 
     def peak(x: float) -> float:

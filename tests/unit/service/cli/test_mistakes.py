@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from loopwright.service.cli.main import main
+from tests.unit.service.cli.columns import columns
 from tests.unit.service.offline.exported_files import files_of, operated
 
 PAGE = Path(__file__).parents[4] / "docs" / "mistakes.md"
@@ -141,7 +142,7 @@ MISTAKES = [
 @pytest.fixture
 def answered(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Answer:
     """The exit status and what the command says, in an empty folder with the files."""
-    monkeypatch.setenv("COLUMNS", "200")
+    columns(monkeypatch, 200)
 
     def answer(mistake: Mistake, folder: Path) -> tuple[int, str]:
         monkeypatch.chdir(folder)

@@ -17,9 +17,10 @@ from typer.testing import CliRunner
 
 from loopwright.service.cli.main import app
 from tests.e2e.transcript import differences
+from tests.unit.service.cli.columns import columns
 
 PAGE = Path(__file__).parents[4] / "docs" / "offline.md"
-COLUMNS = {"rehearse": "100", "tune": "80"}
+COLUMNS = {"rehearse": 100, "tune": 80}
 _FIGURE = re.compile(r'"(\w+)": (-?[\d.]+(?:e-?\d+)?|"[^"]*"|\[[^\]]*\])')
 
 
@@ -49,7 +50,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("command", COLUMNS)
 def test_the_page_shows_what_is_printed(command: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", COLUMNS[command])
+    columns(monkeypatch, COLUMNS[command])
     result = CliRunner().invoke(app, typed(command))
     assert result.exit_code == 0
     said = "\n".join(line.rstrip() for line in (result.stderr + result.stdout).splitlines()) + "\n"

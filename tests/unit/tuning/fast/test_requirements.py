@@ -15,12 +15,12 @@ from loopwright.tuning.analysis.comparison import Comparison, LoopPerformance, l
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.analysis.step_response import step_response
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.design import MAX_WORTH, Aim, DesignSpec, GainDesign, OptimalGains
+from loopwright.tuning.fast.design import MAX_COST_RATIO, Aim, DesignSpec, GainDesign, OptimalGains
 from loopwright.tuning.fast.evaluation import evaluate
 from loopwright.tuning.fast.iae import LoopCost
 from loopwright.tuning.fast.proposal import comparison_on
 from loopwright.tuning.fast.requirements import LOWEST_MS, NEARLY, required
-from loopwright.tuning.fast.weight_bounds import KEPT, Bounds, movement, weights
+from loopwright.tuning.fast.weight_bounds import KEPT, DesignBounds, movement, weights
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction, sign
 from loopwright.tuning.reasons import Reason, Refused
@@ -68,7 +68,7 @@ def test_the_settling_time_of_a_cancelled_pole_is_ln_20_time_constants(T: float)
     responses = LoopCost(TransferFunction((K,), (T, 1.0)), closed).responses(gains.Kp, gains.Ti, 0.0, 10.0)
     exact_s = math.log(20.0) * closed
     for asked_s, kept in ((1.03 * exact_s, True), (0.97 * exact_s, False)):
-        b, missed = next(weights(responses, (1.0, 1.0), Bounds(1.6, settling_s=asked_s)))
+        b, missed = next(weights(responses, (1.0, 1.0), DesignBounds(1.6, settling_s=asked_s)))
         assert b == pytest.approx(1.0) and (missed == KEPT) is kept
         if not kept:
             assert asked_s * (1.0 + missed.settling) == pytest.approx(exact_s, rel=0.02)
@@ -106,7 +106,7 @@ def test_a_settling_time_is_kept_with_the_smallest_Ms(name: str, part: float) ->
     assert spec.settling_s is not None and settling_s <= NEARLY * spec.settling_s
     assert LOWEST_MS - 3e-3 <= Ms <= 1.6 + 3e-3 and Ms == pytest.approx(best.Ms, abs=4e-3)
     least = design_of(name, DesignSpec(best.Ms)).best()
-    assert design_of(name, spec).J(best, least.minimum) <= MAX_WORTH * least.J * 1.02
+    assert design_of(name, spec).J(best, least.minimum) <= MAX_COST_RATIO * least.J * 1.02
     # the Ms that is left over is small: with a tenth less of it no gains are found that are in time
     if best.Ms > LOWEST_MS:
         with pytest.raises(Refused):
@@ -125,7 +125,7 @@ def test_brute_force_finds_no_more_robust_gains_that_settle_in_time() -> None:
             for b in np.linspace(0.4, 2.0, 9):
                 each = cost(Kp, Ti, 0.0, 10.0, b)
                 J = 0.5 * each.setpoint / least.minimum.setpoint + 0.5 * each.load / least.minimum.load
-                if J > MAX_WORTH * least.J:
+                if J > MAX_COST_RATIO * least.J:
                     continue
                 tried += 1
                 found = loop_performance(HEATER, Gains(Kp, Ti, b=b)).setpoint
@@ -156,7 +156,7 @@ def test_a_movement_of_MV_is_kept(name: str, part: float) -> None:
     Ms, _, peak = figures(name, best)
     assert peak <= NEARLY * maximum and Ms <= 1.6 + 3e-3
     # as good as the best of those with the whole Ms; the simulation of these may be off by a percent
-    whole = design_of(name, spec).best_within(Bounds(1.6, mv_peak=0.985 * maximum))
+    whole = design_of(name, spec).best_within(DesignBounds(1.6, mv_peak=0.985 * maximum))
     if whole.missed == KEPT:
         assert 1.003 * design_of(name, spec).J(whole, best.minimum) >= best.J
 
