@@ -134,7 +134,7 @@ class LoopResponses:
         Returns None where no weight from low to high keeps the overshoot.
         """
         room = self.overshoot_room(low, high, overshoot)
-        return None if room is None else self.best_weight(*room)
+        return None if room is None else self.weight_within(*room)
 
     def overshoot_room(self, low: float, high: float, overshoot: float | None) -> tuple[float, float] | None:
         """The smallest and the largest x = 1 - b, for b from low to high, that keep the overshoot, see `best_weight`;
@@ -152,7 +152,7 @@ class LoopResponses:
                 return None
         return minimum, maximum
 
-    def best_weight(self, minimum: float, maximum: float) -> float:
+    def weight_within(self, minimum: float, maximum: float) -> float:
         """The set-point weight b with the least IAE after a set-point step, for 1 - b from minimum to maximum."""
         every = slice(None, None, 1 + len(self.load) // ENOUGH)
         return 1.0 - _minimise_absolutes(self.error[every], self.Kp * self.load[every], minimum, maximum)

@@ -284,8 +284,8 @@ def _instead_of_peak(design: GainDesign, asked: float, smallest: float | None) -
     if smallest is None:
         return f"no gains with an Ms of at most {design.spec.Ms:g} move MV by no more than {asked:g} for each PV unit"
     text = (
-        f"after a set-point step MV has to move by at least {smallest:g} for each PV unit on this loop, and {asked:g} was "
-        "asked for"
+        f"after a set-point step MV has to move by at least {smallest:g} for each PV unit on this loop, and {asked:g} "
+        "was asked for"
     )
     if final := _final_change(design.model):
         text += f"; in the end it has moved by {final:.3g}, one over the plant's gain"

@@ -84,25 +84,25 @@ def weights(
         u, by = movement(responses)
         lower, upper = _within(u, -by, bounds.mv_peak)
         if max(low, lower) > min(high, upper):
-            best = 1.0 - responses.best_weight(low, high)
+            best = 1.0 - responses.weight_within(low, high)
             for x in (_smallest_peak(u, by, low, high), best):
                 yield 1.0 - x, Missed(mv_peak=float(np.abs(u - x * by).max()) / bounds.mv_peak - 1.0)
             return
         low, high = max(low, lower), min(high, upper)
     if bounds.settling_s is None:
-        yield responses.best_weight(low, high), KEPT
+        yield responses.weight_within(low, high), KEPT
         return
     from_low, to_high = _from_each_time_on(responses, low, high)
     asked = math.ceil(bounds.settling_s / responses.h - 1e-9)  # the first time that has to be within the band
     if asked >= len(from_low):  # the response has died away before
-        yield responses.best_weight(low, high), KEPT
+        yield responses.weight_within(low, high), KEPT
         return
     if from_low[asked] <= to_high[asked]:
-        yield responses.best_weight(float(from_low[asked]), float(to_high[asked])), KEPT
+        yield responses.weight_within(float(from_low[asked]), float(to_high[asked])), KEPT
         return
-    best = 1.0 - responses.best_weight(low, high)
+    best = 1.0 - responses.weight_within(low, high)
     if (fastest := _first(from_low <= to_high)) < len(from_low):
-        quick = responses.best_weight(float(from_low[fastest]), float(to_high[fastest]))
+        quick = responses.weight_within(float(from_low[fastest]), float(to_high[fastest]))
         yield quick, Missed(settling=fastest * responses.h / bounds.settling_s - 1.0)
     settled = _first((from_low <= best) & (best <= to_high))
     yield 1.0 - best, Missed(settling=settled * responses.h / bounds.settling_s - 1.0)
