@@ -12,9 +12,12 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from loopwright.service.cli.demo import vcan_usable
 
+settings.register_profile("untimed", settings.default, deadline=None)  # a busy machine makes any test slow
+settings.load_profile("untimed")
 gc.disable()  # until all tests are collected: next to nothing becomes garbage, and each collection goes through all
 _STARTERS = {
     "subprocess",

@@ -168,7 +168,7 @@ class _RequirementSearch:
         if self.bounds.settling_s is None:
             return self._cheapest()
         found = next(filter(None, map(self._noted, self._levels())), None)
-        return None if found is None else self._most_robust(found)
+        return None if found is None else self._with_the_smallest_Ms(found)
 
     def _cheapest(self) -> _Found | None:
         """The gains with the smallest J that keep the movement of MV."""
@@ -202,7 +202,7 @@ class _RequirementSearch:
             return [highest]
         return [highest, *(1.0 + np.geomspace(highest - 1.0, LOWEST_MS - 1.0, LEVELS))[1:].tolist()]
 
-    def _most_robust(self, found: _Found) -> _Found:
+    def _with_the_smallest_Ms(self, found: _Found) -> _Found:
         """The gains with the smallest Ms that keep the requirements."""
         if found.best.Ms <= LOWEST_MS:
             return found
