@@ -16,6 +16,7 @@ from loopwright.tuning.fast.valve_faults import find_valve_fault
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN
 from loopwright.tuning.identification.output_error import Fit, Fitted
+from loopwright.tuning.identification.structures import THIRD_WITH_ZEROS
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -138,6 +139,9 @@ def evaluate(
             reason, detail = _load_with_the_step(fit, found, earlier, best.gains)
     if earlier is not None or not test_follows:
         reason, detail = _instead_of_loads(fit, found, reason, detail)
+    if reason is None and _stand_for_a_curve(record, found):
+        what = "two load disturbances within one test explain the record"
+        reason, detail = Reason.DISTURBED, f"{what}; a plant that is not linear would look the same"
     if reason is None and kept is None:
         reason, detail = Reason.NOT_POSSIBLE, possible_instead(design)
     return Evaluation(
@@ -169,6 +173,15 @@ def _unexplained(record: ExperimentRecord, found: Fitted) -> tuple[Reason, str] 
         at_rest = f"{record.durbin_watson_ratio_at_rest:.2f} at rest"
         return Reason.DISTURBED, f"what the model leaves varies slowly: {ratio:.2f} times white noise, {at_rest}"
     return None
+
+
+def _stand_for_a_curve(record: ExperimentRecord, found: Fitted) -> bool:
+    """Whether the load disturbances of the model may stand for a plant that is not linear in PV, such as a pH.
+
+    Two of them can, under the few moves of PV that pulses make with any structure, under a relay with the richest one.
+    """
+    richest = found.structure == THIRD_WITH_ZEROS
+    return found.hypothesis.load_disturbances > 1 and (record.excitation is Excitation.SETPOINT or richest)
 
 
 def _nonlinearity(fit: Fit[ExperimentRecord], found: Fitted) -> tuple[Reason, str] | None:

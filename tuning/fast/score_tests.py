@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,8 @@ FIRST_DELAY, DELAY_RATIO = 0.4, 1.25
 NOTABLE_LATER = 0.3
 """Size of a second path, a fraction of the plant's effect, that makes Ms about 2 with the gains for Ms 1.6."""
 NEGLIGIBLE_DIRECTION = 1e-9
+FAR = 0.5
+"""Where PV is far from the operating point, as a part of its way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +94,10 @@ class ScoreTests:
         """The clearest alternative to a linear plant, None where the record shows none of a size that matters for
         Ms."""
         shown = []
-        for each in ALTERNATIVES:
-            size, deviation = self.score(each.changed)
+        modelled = self._modelled_pv()
+        scored = [(each, self.score(each.changed)) for each in ALTERNATIVES]
+        scored += [(each, self._regression(each.changed(modelled))) for each in CHANGING_WITH_PV]
+        for each, (size, deviation) in scored:
             if abs(size) > max(each.minimum, STANDARD_DEVIATIONS * deviation):
                 shown.append(Alternative(each.words(size), size, deviation))
         return max(shown, key=lambda each: abs(each.size) / each.deviation, default=None)
@@ -124,11 +129,20 @@ class ScoreTests:
         # a record's input range is its own: the scale of MV must stay that of the fit
         scale = further.record.input_range / fit.record.input_range
         columns = further.regressors(structure, UNDISTURBED, found.theta[None, : structure.searched])[0]
-        response = self._without_known(scale * (columns[:, :inputs] @ found.linear.coefficients[:inputs]))
+        return self._regression(scale * (columns[:, :inputs] @ found.linear.coefficients[:inputs]))
+
+    def _regression(self, column: Reals) -> tuple[float, float]:
+        """The coefficient of a further column of the record in the residual, and its standard deviation."""
+        response = self._without_known(column)
         power = float(response @ response)
         if power <= 0.0:
             return 0.0, math.inf
         return float(response @ self._unexplained) / power, math.sqrt(self._variance / power)
+
+    def _modelled_pv(self) -> Reals:
+        """PV by the model with its load disturbances, a deviation from rest in units of its range, shape (rows,)."""
+        modelled = self._fit.y - self._found.linear.residual
+        return np.asarray(modelled - np.median(modelled[: max(self._fit.record.listened // self._fit.block, 1)]))
 
     def _delays(self) -> list[int]:
         """The delays of a second path that are tried, in samples, up to the length of the longest piece's test."""
@@ -161,15 +175,42 @@ def _fading(size: float) -> str:
 class GainAlternative:
     """An alternative in which the plant's gain is not always the same.
 
-    changed: the further input, MV units, shape (N,), from the record.
+    changed: the further input, MV units, shape (N,), from the record; where the gain changes with PV, the further part
+    of PV, shape (rows,), from the modelled PV.
     minimum: the smallest size that matters.
     words: the alternative of a size in words.
     """
 
-    changed: Callable[[ExperimentRecord], Reals]
+    changed: Callable[[Any], Reals]
     minimum: float
     words: Callable[[float], str]
 
 
+def _pv_above_rest(pv: Reals) -> Reals:
+    return np.maximum(pv, 0.0)
+
+
+def _pv_far_above(pv: Reals) -> Reals:
+    return np.maximum(pv - FAR * max(float(pv.max()), 0.0), 0.0)
+
+
+def _pv_far_below(pv: Reals) -> Reals:
+    return np.minimum(pv - FAR * min(float(pv.min()), 0.0), 0.0)
+
+
+def _pv_sides(size: float) -> str:
+    return f"PV answers {max(1.0 + size, 0.0):.2g} times as much above the operating point as below"
+
+
+def _pv_far(size: float) -> str:
+    return f"PV answers {max(1.0 + size, 0.0):.2g} times as much where it is far from the operating point"
+
+
 CHANGING_WITH_MV = (GainAlternative(above_rest, 0.05, _sides), GainAlternative(squared, 0.03, _curve))
 ALTERNATIVES = (*CHANGING_WITH_MV, GainAlternative(fading, 0.1, _fading))
+CHANGING_WITH_PV = (
+    GainAlternative(_pv_above_rest, 0.05, _pv_sides),
+    GainAlternative(_pv_far_above, 0.1, _pv_far),
+    GainAlternative(_pv_far_below, 0.1, _pv_far),
+)
+"""Plants such as a pH, whose gain depends on where PV is."""
