@@ -94,9 +94,8 @@ class ScoreTests:
         """The clearest alternative to a linear plant, None where the record shows none of a size that matters for
         Ms."""
         shown = []
-        modelled = self._modelled_pv()
         scored = [(each, self.score(each.changed)) for each in ALTERNATIVES]
-        scored += [(each, self._regression(each.changed(modelled))) for each in CHANGING_WITH_PV]
+        scored += [(each, self.score_in_pv(each.changed)) for each in CHANGING_WITH_PV]
         for each, (size, deviation) in scored:
             if abs(size) > max(each.minimum, STANDARD_DEVIATIONS * deviation):
                 shown.append(Alternative(each.words(size), size, deviation))
@@ -131,6 +130,16 @@ class ScoreTests:
         columns = further.regressors(structure, UNDISTURBED, found.theta[None, : structure.searched])[0]
         return self._regression(scale * (columns[:, :inputs] @ found.linear.coefficients[:inputs]))
 
+    def score_in_pv(self, changed: Callable[[Reals], Reals]) -> tuple[float, float]:
+        """The size of an alternative in which the gain changes with PV, as a fraction of the gain, and its standard
+        deviation.
+
+        changed: the further part of PV, shape (rows,), from PV by the model; the size multiplies it.
+        """
+        modelled = self._fit.y - self._found.linear.residual
+        at_rest = np.median(modelled[: max(self._fit.record.listened // self._fit.block, 1)])
+        return self._regression(changed(np.asarray(modelled - at_rest)))
+
     def _regression(self, column: Reals) -> tuple[float, float]:
         """The coefficient of a further column of the record in the residual, and its standard deviation."""
         response = self._without_known(column)
@@ -138,11 +147,6 @@ class ScoreTests:
         if power <= 0.0:
             return 0.0, math.inf
         return float(response @ self._unexplained) / power, math.sqrt(self._variance / power)
-
-    def _modelled_pv(self) -> Reals:
-        """PV by the model with its load disturbances, a deviation from rest in units of its range, shape (rows,)."""
-        modelled = self._fit.y - self._found.linear.residual
-        return np.asarray(modelled - np.median(modelled[: max(self._fit.record.listened // self._fit.block, 1)]))
 
     def _delays(self) -> list[int]:
         """The delays of a second path that are tried, in samples, up to the length of the longest piece's test."""
@@ -186,15 +190,15 @@ class GainAlternative:
     words: Callable[[float], str]
 
 
-def _pv_above_rest(pv: Reals) -> Reals:
+def pv_above_rest(pv: Reals) -> Reals:
     return np.maximum(pv, 0.0)
 
 
-def _pv_far_above(pv: Reals) -> Reals:
+def pv_far_above(pv: Reals) -> Reals:
     return np.maximum(pv - FAR * max(float(pv.max()), 0.0), 0.0)
 
 
-def _pv_far_below(pv: Reals) -> Reals:
+def pv_far_below(pv: Reals) -> Reals:
     return np.minimum(pv - FAR * min(float(pv.min()), 0.0), 0.0)
 
 
@@ -209,8 +213,8 @@ def _pv_far(size: float) -> str:
 CHANGING_WITH_MV = (GainAlternative(above_rest, 0.05, _sides), GainAlternative(squared, 0.03, _curve))
 ALTERNATIVES = (*CHANGING_WITH_MV, GainAlternative(fading, 0.1, _fading))
 CHANGING_WITH_PV = (
-    GainAlternative(_pv_above_rest, 0.05, _pv_sides),
-    GainAlternative(_pv_far_above, 0.1, _pv_far),
-    GainAlternative(_pv_far_below, 0.1, _pv_far),
+    GainAlternative(pv_above_rest, 0.05, _pv_sides),
+    GainAlternative(pv_far_above, 0.1, _pv_far),
+    GainAlternative(pv_far_below, 0.1, _pv_far),
 )
 """Plants such as a pH, whose gain depends on where PV is."""

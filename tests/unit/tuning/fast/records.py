@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,12 +96,13 @@ def pulse_record(
     later: float = 0.0,
     load: float = 0.0,
     periods: float = 3.0,
+    load_lasts: float = math.inf,
 ) -> ExperimentRecord:
     """Pulses of the set-point by 1 up, down and up, turned after 0.7 and 1.7 ultimate periods, over three periods.
 
     below: the plant's gain below rest, as a part of that above.  end: the gain at the end over that at rest.
     share, later: a second path, a part of the first one, ultimate periods later.  load: MV units, 1.3 periods
-    before the end.  periods: the length of the test.
+    before the end, for so many periods.  periods: the length of the test.
     """
     plant = LinearPlant(bench.num, bench.den, bench.L, bench.Ts, noise_std=noise, seed=seed)
     channel = Channel(bench.Ts, Settings(-50.0, 50.0, 0.0), Parameters(Kp, Ti), 0.0, Mode.AUTOMATIC)
@@ -109,8 +111,8 @@ def pulse_record(
     samples = LISTENED + round(periods * period)
     for k in range(samples):
         channel.setpoint = 0.0 if k < LISTENED else -1.0 if 0.7 < (k - LISTENED) / period < 1.7 else 1.0
-        if load and k == samples - round(1.3 * period):
-            plant.disturbance = load
+        since = (k - samples) / period + 1.3
+        plant.disturbance = load if 0.0 <= since < load_lasts else 0.0
         y.append(plant.pv)
         u.append(channel.step(y[-1]))
         gain = 1.0 + (end - 1.0) * max(k - LISTENED, 0) / (samples - LISTENED)

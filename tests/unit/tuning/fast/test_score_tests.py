@@ -8,7 +8,15 @@ import pytest
 
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import evaluate
-from loopwright.tuning.fast.score_tests import ScoreTests, above_rest, fading, late, squared
+from loopwright.tuning.fast.score_tests import (
+    CHANGING_WITH_PV,
+    ScoreTests,
+    above_rest,
+    fading,
+    late,
+    pv_above_rest,
+    squared,
+)
 from loopwright.tuning.fast.structure_choice import choose_structure
 from loopwright.tuning.identification.output_error import Fit
 from loopwright.tuning.reasons import Reason
@@ -26,6 +34,9 @@ def test_a_linear_plant_is_not_told_to_be_another(name: str, seed: int) -> None:
     for changed in (above_rest, squared):
         size, deviation = linearity.score(changed)
         assert abs(size) < 4.0 * deviation and deviation < 0.1
+    for alternative in CHANGING_WITH_PV:
+        size, deviation = linearity.score_in_pv(alternative.changed)
+        assert abs(size) < 4.0 * deviation
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -97,3 +108,30 @@ def test_mv_that_is_late_begins_each_piece_with_nothing() -> None:
     assert moved[:40] == pytest.approx(0.0) and moved[half : half + 40] == pytest.approx(0.0)
     assert moved[40:half] == pytest.approx(record.u[: half - 40])
     assert moved[half + 40 :] == pytest.approx(record.u[half:-40])
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_gain_that_changes_with_PV_is_seen_with_its_size(name: str) -> None:
+    """For a small change the fit hardly bends: the score is then the change itself."""
+    found = pulse_record(*LOOPS[name], noise=0.001)
+    bent = replace(found, y=found.y + 0.03 * pv_above_rest(found.y))
+    fit = Fit(bent)
+    size, deviation = ScoreTests(fit, choose_structure(fit).best).score_in_pv(pv_above_rest)
+    assert size == pytest.approx(0.03, abs=4.0 * deviation + 0.01)
+
+
+@pytest.mark.parametrize("above", [0.6, 1.6])
+@pytest.mark.parametrize("name", LOOPS)
+def test_gains_for_a_plant_that_changes_with_PV_are_not_proposed(name: str, above: float) -> None:
+    found = pulse_record(*LOOPS[name], noise=0.005)
+    bent = replace(found, y=found.y + (above - 1.0) * pv_above_rest(found.y))
+    assert evaluate(bent, DesignSpec(1.6)).reason is not None
+
+
+def test_two_load_disturbances_under_pulses_are_not_believed() -> None:
+    record_of_two = pulse_record(THREE_LAGS, 0.8, 3.0, noise=0.002, load=1.0, load_lasts=0.6, periods=4.0)
+    evaluation = evaluate(record_of_two, DesignSpec(1.6))
+    assert evaluation.chosen.best.hypothesis.load_disturbances == 2
+    assert evaluation.reason is Reason.DISTURBED and "two load disturbances" in evaluation.detail
+    one = evaluate(pulse_record(THREE_LAGS, 0.8, 3.0, noise=0.002, load=1.0, periods=4.0), DesignSpec(1.6))
+    assert one.chosen.best.hypothesis.load_disturbances == 1 and one.reason is None
