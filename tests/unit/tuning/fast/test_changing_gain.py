@@ -69,7 +69,7 @@ def test_nor_in_pulses(bench: Bench, Kp: float, Ti: float, seed: int) -> None:
     assert best.hypothesis.load_disturbances
     changing = find_changing_gain(fit, best)
     assert changing is None or changing.bic_gain < -5.0 * RIVAL_BIC
-    assert evaluate(fit.record, DesignSpec(1.6)).reason is None
+    assert evaluate(fit.record, DesignSpec(1.6)).reason not in (Reason.UNEXPLAINED, Reason.AMBIGUOUS)
 
 
 def test_a_record_that_only_load_disturbances_would_explain_otherwise_is_refused_with_the_change() -> None:
