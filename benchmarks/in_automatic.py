@@ -31,7 +31,7 @@ from loopwright.tuning.models import Model, Reals, TransferFunction
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Refused
 
-TS, SAMPLES, NOISE, WRONG, MOST_MS = 0.2, 1500, 0.01, 0.1, 2.0
+TS, SAMPLES, NOISE, WRONG, MAX_MS = 0.2, 1500, 0.01, 0.1, 2.0
 SETPOINTS: dict[str, dict[int, float]] = {
     "SP rests": {},
     "one change": {100: 1.0},
@@ -104,7 +104,7 @@ def errors(model: Model, true: Model) -> tuple[float, float]:
     off = {}
     for name, each in found.items():
         Ms = margins(model, each.gains).Ms if each.gains else None
-        if each.gains and Ms is not None and Ms < MOST_MS:
+        if each.gains and Ms is not None and Ms < MAX_MS:
             off[name] = abs((margins(true, each.gains).Ms or np.inf) - Ms)
     best = recommended({name: each.assessment for name, each in found.items() if each.assessment})
     return (off.get(best.method, 0.0) if best else 0.0), max(off.values(), default=0.0)
