@@ -93,7 +93,8 @@ def evaluate(
     load disturbance or backlash can look like a gain that differs above and below rest there, and the test tells them
     apart.
     Raises Refused, where the model permits no such controller: UNEXPLAINED or DISTURBED where the model does not
-    explain the record, else NOT_ROBUST. With `earlier` a record that is not explained is evaluated with its gains.
+    explain the record, else NOT_ROBUST. Where `earlier` is given, a record that is not explained is evaluated with the
+    gains of `earlier`.
     """
     fit = Fit(record)
     chosen = choose_structure(fit, earlier.chosen.fits if earlier else ())
@@ -206,8 +207,8 @@ def _instead_of_loads(
     disturbances says to them.
 
     Where one of them explains the record as well as the load disturbances do, the model is ambiguous: PV answers the
-    next step twice where there is a second path, and a load disturbance stays as it is. A gain that changes explains
-    the record better or not at all.
+    next step twice where there is a second path, and a load disturbance stays as it is. Where a gain that changes
+    explains the record better, the record is not explained by a linear plant.
     """
     instead = instead_of_loads(fit, found)
     # a record of one side hardly shows the other one, and its proposal says so

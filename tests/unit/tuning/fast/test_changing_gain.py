@@ -72,7 +72,7 @@ def test_nor_in_pulses(bench: Bench, Kp: float, Ti: float, seed: int) -> None:
     assert evaluate(fit.record, DesignSpec(1.6)).reason not in (Reason.UNEXPLAINED, Reason.AMBIGUOUS)
 
 
-def test_a_record_that_only_load_disturbances_would_explain_otherwise_is_refused_with_the_change() -> None:
+def test_a_curved_valve_in_place_of_load_disturbances_is_refused_with_its_size() -> None:
     evaluation = evaluate(curved(THREE_LAGS, 0.2), DesignSpec(1.6))
     assert evaluation.reason in (Reason.UNEXPLAINED, Reason.AMBIGUOUS, Reason.UNCERTAIN)
     assert "the plant's gain" in evaluation.detail
