@@ -61,14 +61,14 @@ class NotMeasured:
 def figures(benchmark: Benchmark) -> dict[str, Any] | NotMeasured:
     """The JSON object that a benchmark prints; under user-mode Linux its progress comes before it."""
     found = subprocess.run(benchmark.command, stdout=subprocess.PIPE, text=True)
-    told = "\n" + found.stdout.replace("\r", "")
+    printed = "\n" + found.stdout.replace("\r", "")
     if found.returncode == CANNOT and benchmark.lacks:
         return NotMeasured(benchmark.lacks, wrong=False)
     if found.returncode:
         print(found.stdout, file=sys.stderr)
         return NotMeasured(f"it ended with status {found.returncode}, see what it said above", wrong=True)
     try:
-        answer: dict[str, Any] = json.JSONDecoder().raw_decode(told[told.rindex("\n{") + 1 :])[0]
+        answer: dict[str, Any] = json.JSONDecoder().raw_decode(printed[printed.rindex("\n{") + 1 :])[0]
     except ValueError:
         print(found.stdout, file=sys.stderr)
         return NotMeasured("it ended without figures, see what it said above", wrong=True)

@@ -225,7 +225,7 @@ class PredictedView(Figures):
     IAE_per_unit: float | None = Field(description="IAE of a unit set-point step, s; null: an offset remains")
 
 
-class StepWorthView(Figures):
+class StepPerformanceView(Figures):
     """The response to a unit step of the set-point (PV units) or of the load at the plant's input (percent of MV)."""
 
     IAE: float | None = Field(
@@ -242,7 +242,7 @@ class StepWorthView(Figures):
     )
 
 
-class WorthView(Figures):
+class PerformanceView(Figures):
     """Performance of gains on the identified model, computed, not measured. Figures are null for an unstable loop."""
 
     stable: bool
@@ -252,15 +252,15 @@ class WorthView(Figures):
     PM_deg: float | None = Field(description="Phase margin, degrees; null: no crossing")
     noise_gain: float | None = Field(description="Immediate change of MV for a jump of PV, percent per PV unit")
     overshoot_pct: float | None = Field(description="Overshoot of a set-point step, percent")
-    setpoint: StepWorthView | None = Field(description="Response to a unit step of the set-point")
-    load: StepWorthView | None = Field(description="Response to a unit step of the load")
+    setpoint: StepPerformanceView | None = Field(description="Response to a unit step of the set-point")
+    load: StepPerformanceView | None = Field(description="Response to a unit step of the load")
 
 
 class ComparisonView(Figures):
     """The present and the new gains on the identified model, and whether the new gains meet the request better."""
 
-    before: WorthView = Field(description="Performance of the present gains")
-    after: WorthView = Field(description="Performance of the new gains")
+    before: PerformanceView = Field(description="Performance of the present gains")
+    after: PerformanceView = Field(description="Performance of the new gains")
     Ms_asked: float = Field(description="Requested upper bound of Ms", examples=[1.6])
     settling_s_asked: float | None = Field(
         default=None,

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from pydantic import Field
+from pydantic import AliasChoices, Field
 
 from loopwright.service.jobs.alternatives import asked_spec
 from loopwright.service.jsonable import json_object
-from loopwright.service.results import Figures, GainsView, WorthView
+from loopwright.service.results import Figures, GainsView, PerformanceView
 from loopwright.service.states.loop_state import gains_of, loop_state
 from loopwright.service.store.jobs import Job
 from loopwright.tuning.analysis.comparison import loop_performance
@@ -36,7 +36,10 @@ class DesignPoint(Figures):
         description="How far Ms of these gains may be off on the plant; null: not known, the job has no record",
         examples=[0.03],
     )
-    worth: WorthView | None = Field(description="Performance of the gains on the model; null: there are no gains")
+    performance: PerformanceView | None = Field(
+        validation_alias=AliasChoices("performance", "worth"),  # jobs of 0.1.0's development are stored with the latter
+        description="Performance of the gains on the model; null: there are no gains",
+    )
     reason: Reason | None = Field(description="Why there are no gains; reason code from the closed list")
     detail: str | None = Field(description="The numbers behind the reason")
     advice: str | None = Field(description="What the operator should do about the reason")
@@ -63,8 +66,8 @@ class DesignCurve(Figures):
     sampling_delay_s: float = Field(
         description="Delay of the sampling, which the figures have beside the dead time, s", examples=[0.05]
     )
-    before: WorthView | None = Field(description="Performance of the gains before the job; null: not known")
-    after: WorthView | None = Field(description="Performance of the gains of the job; null: it has none")
+    before: PerformanceView | None = Field(description="Performance of the gains before the job; null: not known")
+    after: PerformanceView | None = Field(description="Performance of the gains of the job; null: it has none")
     designs: list[DesignPoint] = Field(description="One entry for each Ms, in rising order")
 
 
@@ -91,13 +94,13 @@ class _Designing:
         except Ended as refusal:
             return _refused(Ms, refusal)
         return DesignPoint(
-            Ms_asked=Ms, gains=GainsView.of(gains), uncertainty=unsure, worth=self.worth(gains),
+            Ms_asked=Ms, gains=GainsView.of(gains), uncertainty=unsure, performance=self.performance(gains),
             reason=None, detail=None, advice=None,
         )  # fmt: skip
 
-    def worth(self, gains: Gains) -> WorthView:
+    def performance(self, gains: Gains) -> PerformanceView:
         found = json_object(loop_performance(self.model, gains, self.Ts))
-        return WorthView.model_validate(found)
+        return PerformanceView.model_validate(found)
 
 
 def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> DesignCurve:
@@ -131,8 +134,8 @@ def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> Desig
         den=list(model.den),
         dead_time_s=model.L,
         sampling_delay_s=delay_s,
-        before=None if old is None else designing.worth(old),
-        after=None if new is None else designing.worth(new),
+        before=None if old is None else designing.performance(old),
+        after=None if new is None else designing.performance(new),
         designs=points,
     )
 
@@ -159,6 +162,6 @@ def _on_model(model: Model, Ts: float, spec: DesignSpec) -> _Designing:
 
 def _refused(Ms: float, refusal: Ended) -> DesignPoint:
     return DesignPoint(
-        Ms_asked=Ms, gains=None, uncertainty=None, worth=None,
+        Ms_asked=Ms, gains=None, uncertainty=None, performance=None,
         reason=refusal.reason, detail=refusal.detail, advice=ADVICE[refusal.reason],
     )  # fmt: skip

@@ -25,7 +25,7 @@ from loopwright.service.api.report.words import (
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.jobs.design_curve import DesignCurve
 from loopwright.service.jobs.job_record import FITTED, JobRecord
-from loopwright.service.results import GainsView, StepWorthView, TransferModelView, WorthView
+from loopwright.service.results import GainsView, PerformanceView, StepPerformanceView, TransferModelView
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store.jobs import JobEvent
 from loopwright.service.store.sample_blocks import Block
@@ -76,7 +76,7 @@ def paper(source: ReportSource) -> str:
     job, loop = source.job, source.loop
     pv_unit = "PV units" if loop is None else n.unit(loop.pv_unit)
     old, new = job.old_gains, job.new_gains
-    model, before, after = _model(source), _worth(source, False), _worth(source, True)
+    model, before, after = _model(source), _performance(source, False), _performance(source, True)
     size = _step_size(source)
     Ms = after.Ms if after is not None else before.Ms if before is not None else None
     steps = None
@@ -159,7 +159,7 @@ def _model(source: ReportSource) -> Model | None:
     return delayed(source.job.model.process_model(), 0.5 * (source.job.sample_time_s or 0.0))
 
 
-def _worth(source: ReportSource, after: bool) -> WorthView | None:
+def _performance(source: ReportSource, after: bool) -> PerformanceView | None:
     if (compared := source.job.comparison) is not None:
         return compared.after if after else compared.before
     if source.designs is None:
@@ -233,8 +233,8 @@ TableRow = tuple[str, str, str, str, str]
 def _table(
     old: GainsView | None,
     new: GainsView | None,
-    before: WorthView | None,
-    after: WorthView | None,
+    before: PerformanceView | None,
+    after: PerformanceView | None,
     job: JobView,
     pv_unit: str,
 ) -> list[TableRow]:
@@ -273,7 +273,7 @@ def _table(
 
     def figure_step(name: str, which: str) -> tuple[float | None, float | None]:
         values = [None if each is None else getattr(each, which) for each in (before, after)]
-        found = [getattr(each, name) if isinstance(each, StepWorthView) else None for each in values]
+        found = [getattr(each, name) if isinstance(each, StepPerformanceView) else None for each in values]
         return found[0], found[1]
 
     compared = job.comparison
@@ -302,8 +302,8 @@ def _at_most(asked: float | None) -> str:
     return "" if asked is None else f"; asked for: at most {n.significant(asked)}"
 
 
-def _stable(worth: WorthView | None) -> str:
-    return n.DASH if worth is None else "stable" if worth.stable else "not stable"
+def _stable(performance: PerformanceView | None) -> str:
+    return n.DASH if performance is None else "stable" if performance.stable else "not stable"
 
 
 def _record_note(record: JobRecord | None, decimals: int, pv_unit: str) -> str:
@@ -385,9 +385,9 @@ def _designs(curve: DesignCurve | None) -> list[list[str]]:
         return []
     rows = []
     for each in curve.designs[::_SHOWN_DESIGNS]:
-        if each.gains is None or each.worth is None:
+        if each.gains is None or each.performance is None:
             continue
-        worth = each.worth
+        performance = each.performance
         rows.append(
             [
                 n.fixed(each.Ms_asked, 2),
@@ -396,11 +396,11 @@ def _designs(curve: DesignCurve | None) -> list[list[str]]:
                 *([n.significant(each.gains.Td)] if _with_td(curve) else []),
                 *([n.significant(each.gains.b, 3)] if _with_b(curve) else []),
                 *([n.Ms_error(each.uncertainty)] if _with_error(curve) else []),
-                n.fixed(worth.GM, 2),
-                n.fixed(worth.PM_deg, 0),
-                n.fixed(worth.overshoot_pct, 0),
-                n.significant(worth.setpoint.IAE if worth.setpoint else None, 3),
-                n.significant(worth.load.IAE if worth.load else None, 3),
+                n.fixed(performance.GM, 2),
+                n.fixed(performance.PM_deg, 0),
+                n.fixed(performance.overshoot_pct, 0),
+                n.significant(performance.setpoint.IAE if performance.setpoint else None, 3),
+                n.significant(performance.load.IAE if performance.load else None, 3),
             ]
         )
     return rows

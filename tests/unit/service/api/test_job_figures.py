@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import threading
 from collections.abc import Callable, Iterator
@@ -30,6 +31,7 @@ from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.inputs.request import retune_request
 from loopwright.service.jobs import job_figures
+from loopwright.service.jobs.design_curve import DesignPoint
 from loopwright.service.jobs.job_record import driven, job_record, unpack
 from loopwright.service.jobs.kept_figures import KeptFigures
 from loopwright.service.jobs.manager import Jobs
@@ -136,13 +138,20 @@ def test_the_designs_have_the_Ms_asked_for_by_another_way(here: Here, job: str) 
     for each in designs:
         assert each["reason"] is None and 0.0 < each["uncertainty"] < 0.1
         assert peak_of_sensitivity(found, each["gains"]) == pytest.approx(each["Ms_asked"], abs=0.01)
-        assert each["worth"]["Ms"] == pytest.approx(each["Ms_asked"], abs=0.01)
+        assert each["performance"]["Ms"] == pytest.approx(each["Ms_asked"], abs=0.01)
     # faster: a load is made good sooner, and the margins shrink
-    assert np.all(np.diff([each["worth"]["load"]["IAE"] for each in designs]) < 0.0)
-    assert np.all(np.diff([each["worth"]["GM"] for each in designs]) < 0.0)
+    assert np.all(np.diff([each["performance"]["load"]["IAE"] for each in designs]) < 0.0)
+    assert np.all(np.diff([each["performance"]["GM"] for each in designs]) < 0.0)
     # with integral action the integral of the error after a unit load is Ti/Kp; here PV does not cross its set-point
     slow = designs[0]
-    assert slow["worth"]["load"]["IAE"] == pytest.approx(slow["gains"]["Ti"] / slow["gains"]["Kp"], rel=0.02)
+    assert slow["performance"]["load"]["IAE"] == pytest.approx(slow["gains"]["Ti"] / slow["gains"]["Kp"], rel=0.02)
+
+
+def test_designs_that_are_stored_with_the_earlier_name_of_the_performance_are_read(here: Here, job: str) -> None:
+    with here.client() as client:
+        found = client.get(f"/jobs/{job}/designs").json()["designs"][0]
+    earlier = {("worth" if name == "performance" else name): value for name, value in found.items()}
+    assert DesignPoint.model_validate_json(json.dumps(earlier)).model_dump(mode="json") == found
 
 
 def test_the_designs_are_those_of_alternatives(here: Here, job: str) -> None:

@@ -46,7 +46,7 @@ export function yRange(columns, least) {
 /**
  * @typedef {{label: string, colour: string, dash?: number[], width?: number, stepped?: boolean}} Line
  * @typedef {{lines: Line[], height: number, withTime: boolean, zero?: () => number | null, beneath?: (u: any, ctx: CanvasRenderingContext2D) => void,
- *   above?: (u: any, ctx: CanvasRenderingContext2D) => void, onCursor?: (u: any) => void, onSelect?: (from: number, to: number) => void, sync?: string}} Wish
+ *   above?: (u: any, ctx: CanvasRenderingContext2D) => void, onCursor?: (u: any) => void, onSelect?: (from: number, to: number) => void, sync?: string}} PlotOptions
  */
 
 /**
@@ -67,9 +67,9 @@ function gapsOf(u, at, values, first, last) {
 
 /**
  * Makes a plot. Words are drawn in `draw`: `drawClear` comes before the grid.
- * @param {HTMLElement} where @param {Wish} wish
+ * @param {HTMLElement} where @param {PlotOptions} options
  */
-export function makePlot(where, wish) {
+export function makePlot(where, options) {
   const axis = {
     stroke: () => colour("ink-2"),
     font: FONT,
@@ -79,25 +79,25 @@ export function makePlot(where, wish) {
   const plot = new uPlot(
     {
       width: Math.max(200, where.clientWidth),
-      height: wish.height,
+      height: options.height,
       pxAlign: true,
       legend: { show: false },
-      padding: [8, RIGHT, wish.withTime ? 0 : 8, 0],
-      cursor: { sync: wish.sync ? { key: wish.sync, setSeries: false, scales: ["x", null] } : undefined, points: { show: false }, y: false, drag: { x: true, y: false, setScale: false } },
+      padding: [8, RIGHT, options.withTime ? 0 : 8, 0],
+      cursor: { sync: options.sync ? { key: options.sync, setSeries: false, scales: ["x", null] } : undefined, points: { show: false }, y: false, drag: { x: true, y: false, setScale: false } },
       scales: { x: { time: false, auto: false, range: (_u, low, high) => [low, high] }, y: { auto: false, range: (_u, low, high) => [low, high] } },
       axes: [
         {
           ...axis,
           show: true,
-          size: wish.withTime ? 24 : 0,
+          size: options.withTime ? 24 : 0,
           splits: (u, _n, low, high) => {
-            const zero = wish.zero?.() ?? 0;
+            const zero = options.zero?.() ?? 0;
             const distance = tickDistance(high - low, Math.max(2, Math.floor(u.bbox.width / devicePixelRatio / 110)));
             return ticks(low - zero, high - zero, distance).map((value) => value + zero);
           },
           values: (_u, splits) => {
-            if (!wish.withTime) return splits.map(() => "");
-            const zero = wish.zero?.() ?? null;
+            if (!options.withTime) return splits.map(() => "");
+            const zero = options.zero?.() ?? null;
             const distance = splits.length > 1 ? splits[1] - splits[0] : 1;
             return splits.map((value) => (zero === null ? timeOfDay(value) : `${tick(value - zero, distance)} s`));
           },
@@ -112,7 +112,7 @@ export function makePlot(where, wish) {
       ],
       series: [
         {},
-        ...wish.lines.map((line) => ({
+        ...options.lines.map((line) => ({
           label: line.label,
           stroke: () => colour(line.colour),
           width: line.width ?? 1.5,
@@ -132,34 +132,34 @@ export function makePlot(where, wish) {
             u.ctx.beginPath();
             u.ctx.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height);
             u.ctx.clip();
-            wish.beneath?.(u, u.ctx);
+            options.beneath?.(u, u.ctx);
             u.ctx.restore();
           },
         ],
         draw: [
           (u) => {
-            if (!wish.above) return;
+            if (!options.above) return;
             u.ctx.save();
             u.ctx.beginPath();
             u.ctx.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height);
             u.ctx.clip();
-            wish.above(u, u.ctx);
+            options.above(u, u.ctx);
             u.ctx.restore();
           },
         ],
-        setCursor: [(u) => wish.onCursor?.(u)],
+        setCursor: [(u) => options.onCursor?.(u)],
         setSelect: [
           (u) => {
             if (u.select.width < 6) return;
             const from = u.posToVal(u.select.left, "x");
             const to = u.posToVal(u.select.left + u.select.width, "x");
             u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
-            wish.onSelect?.(from, to);
+            options.onSelect?.(from, to);
           },
         ],
       },
     },
-    [[], ...wish.lines.map(() => [])],
+    [[], ...options.lines.map(() => [])],
     where,
   );
   const observer = new ResizeObserver(() => plot.setSize({ width: Math.max(200, where.clientWidth), height: plot.height }));

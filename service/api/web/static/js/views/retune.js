@@ -15,7 +15,7 @@ const [SOON_MS, LATER_MS] = [5000, 30_000];
 
 /** @param {{loop: any, onClose: (() => void) | null, onStarted: (job: any) => void}} props */
 export function RetuneForm({ loop, onClose, onStarted }) {
-  const [wish, setWish] = useState(/** @type {Record<string, any>} */ ({ method: "fast", ms: 1.6 }));
+  const [form, setForm] = useState(/** @type {Record<string, any>} */ ({ method: "fast", ms: 1.6 }));
   const [more, setMore] = useState(false);
   const [methods, setMethods] = useState(/** @type {any[]} */ ([]));
   const [preview, setPreview] = useState(/** @type {any} */ (null));
@@ -24,7 +24,7 @@ export function RetuneForm({ loop, onClose, onStarted }) {
   const [sending, setSending] = useState(false);
   const first = useRef(/** @type {HTMLElement | null} */ (null));
   const row = rowOf(loop.tag).value;
-  const { body, bad } = bodyOf(wish);
+  const { body, bad } = bodyOf(form);
   const asked = JSON.stringify(body);
   const situation = `${row?.mode} ${row?.not_heard ? "silent" : ""} ${loop.locked?.since ?? ""}`;
 
@@ -67,7 +67,7 @@ export function RetuneForm({ loop, onClose, onStarted }) {
 
   const set = (/** @type {string} */ name) => (/** @type {any} */ event) => {
     const { type, checked, value } = event.target;
-    setWish({ ...wish, [name]: type === "checkbox" ? checked : value });
+    setForm({ ...form, [name]: type === "checkbox" ? checked : value });
   };
   const start = async () => {
     setSending(true);
@@ -79,7 +79,7 @@ export function RetuneForm({ loop, onClose, onStarted }) {
       setSending(false);
     }
   };
-  const designed = wish.method === "fast" || wish.method === "setpoint";
+  const designed = form.method === "fast" || form.method === "setpoint";
   const obstacle = preview?.obstacles.find((/** @type {any} */ each) => !PASSING.includes(each.reason));
   const unsigned = !signature.value.trim();
   const why = isSilent.value ? "The service is silent." : bad ? bad : obstacle ? "" : unsigned ? "Who signs?" : "";
@@ -87,62 +87,62 @@ export function RetuneForm({ loop, onClose, onStarted }) {
   return html`<section class="card" aria-label="Retune" style=${{ marginTop: "16px" }}>
     <div class="split" key="top"><h2 class="title">Retune</h2>${onClose && html`<button class="plain" aria-label="Close the form" onClick=${onClose}>✕</button>`}</div>
     <div class="two" key="two"><div class="explain" aria-live="polite">${preview ? What(preview, loop) : html`<p class="quiet">Asking what would happen…</p>`}</div>
-      <div>${designed && html`<label key="ms" class="field"><span>Robustness asked for <b>Ms ${ms(Number(wish.ms))}</b></span>
-        <input ref=${first} type="range" min="1.2" max="2" step="0.05" value=${wish.ms} onInput=${set("ms")} aria-valuetext=${`Ms ${ms(Number(wish.ms))}`} /></label>
+      <div>${designed && html`<label key="ms" class="field"><span>Robustness asked for <b>Ms ${ms(Number(form.ms))}</b></span>
+        <input ref=${first} type="range" min="1.2" max="2" step="0.05" value=${form.ms} onInput=${set("ms")} aria-valuetext=${`Ms ${ms(Number(form.ms))}`} /></label>
         <div class="ends" key="ends"><span>1.2 robust</span><span>1.6</span><span>fast 2.0</span></div>`}
         <button key="more" class="plain" aria-expanded=${String(more)} onClick=${() => setMore(!more)}>${more ? "Fewer options" : "More options"}</button></div></div>
     ${more && html`<div class="options" key="options">
-      <label class="field"><span>Procedure</span><select class="wide" value=${wish.method} onChange=${set("method")}>
+      <label class="field"><span>Procedure</span><select class="wide" value=${form.method} onChange=${set("method")}>
         <option value="fast">fast: one record</option><option value="setpoint">set-point pulses</option><option value="five-stage">five-stage</option>
         ${methods.filter((each) => !["fast", "setpoint", "five-stage", "observe"].includes(each.method)).map((each) => html`<option key=${each.method} value=${each.method}>${each.title ?? each.method}</option>`)}</select></label>
-      ${wish.method === "fast" && Field("amplitude_pct", "Relay up by", "%", preview?.first_mv_move_pct, wish, set, problem)}
-      ${Field("mv_low", "MV not below", "%", loop.mv_limits.low, wish, set, problem)}${Field("mv_high", "MV not above", "%", loop.mv_limits.high, wish, set, problem)}
-      ${Field("pv_low", "Abort below", u, loop.pv_limits.low, wish, set, problem)}${Field("pv_high", "Abort above", u, loop.pv_limits.high, wish, set, problem)}
-      ${Field("sp_deviation", "SP step", u, loop.sp_deviation, wish, set, problem)}
-      ${designed && html`<label class="check"><input type="checkbox" checked=${!!wish.derivative} onChange=${set("derivative")} /> derivative, where it pays</label>`}
-      ${designed && html`<label class="field"><span>The best for</span><select class="wide" value=${wish.aim ?? "balanced"} onChange=${set("aim")}>
+      ${form.method === "fast" && Field("amplitude_pct", "Relay up by", "%", preview?.first_mv_move_pct, form, set, problem)}
+      ${Field("mv_low", "MV not below", "%", loop.mv_limits.low, form, set, problem)}${Field("mv_high", "MV not above", "%", loop.mv_limits.high, form, set, problem)}
+      ${Field("pv_low", "Abort below", u, loop.pv_limits.low, form, set, problem)}${Field("pv_high", "Abort above", u, loop.pv_limits.high, form, set, problem)}
+      ${Field("sp_deviation", "SP step", u, loop.sp_deviation, form, set, problem)}
+      ${designed && html`<label class="check"><input type="checkbox" checked=${!!form.derivative} onChange=${set("derivative")} /> derivative, where it pays</label>`}
+      ${designed && html`<label class="field"><span>The best for</span><select class="wide" value=${form.aim ?? "balanced"} onChange=${set("aim")}>
         <option value="balanced">set-point and load alike</option><option value="setpoint">set-point steps</option><option value="load">load disturbances</option><option value="no_overshoot">both, without overshoot</option></select></label>`}
-      ${designed && Field("settling_s", "Settled within 5 % in", "s", null, wish, set, problem)}
-      ${designed && Field("mv_peak", "MV moved at most by", `% per ${u}`, null, wish, set, problem)}
-      ${wish.method === "fast" && html`<label class="check"><input type="checkbox" checked=${!!wish.careful} onChange=${set("careful")} /> careful: six switches at least</label>`}
-      <label class="check"><input type="checkbox" checked=${!!wish.dry_run} onChange=${set("dry_run")} /> rehearsal: computed in memory, nothing is moved</label>
+      ${designed && Field("settling_s", "Settled within 5 % in", "s", null, form, set, problem)}
+      ${designed && Field("mv_peak", "MV moved at most by", `% per ${u}`, null, form, set, problem)}
+      ${form.method === "fast" && html`<label class="check"><input type="checkbox" checked=${!!form.careful} onChange=${set("careful")} /> careful: six switches at least</label>`}
+      <label class="check"><input type="checkbox" checked=${!!form.dry_run} onChange=${set("dry_run")} /> rehearsal: computed in memory, nothing is moved</label>
     </div>`}
     ${preview?.obstacles.map((/** @type {any} */ each) => html`<div class="refusal" key=${each.reason}><p>${sentence(each.detail)} <span class="advice">${each.advice}</span> ${each.job && html`<a href=${jobPath(each.job)}>to that job</a>`}</p></div>`)}
     ${problem && html`<div class="refusal" role="alert" key="problem"><p>${sentence(problem.message)} <span class="advice">${problem.advice}</span> ${problem.job && html`<a href=${jobPath(problem.job)}>to that job</a>`}</p></div>`}
     <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} /></label>
       <span class="quiet" role="status">${why}</span>
-      <button class="main" disabled=${sending || !!why || !!obstacle} onClick=${start}>${wish.dry_run ? "Rehearse" : "Retune"} ${loop.tag}</button></div>
+      <button class="main" disabled=${sending || !!why || !!obstacle} onClick=${start}>${form.dry_run ? "Rehearse" : "Retune"} ${loop.tag}</button></div>
   </section>`;
 }
 
-/** @param {string} name @param {string} label @param {string} u @param {number | null | undefined} usual @param {any} wish @param {any} set @param {any} problem */
-function Field(name, label, u, usual, wish, set, problem) {
-  const wrong = problem?.errors?.find((/** @type {any} */ each) => each.where.endsWith(name)) || Number.isNaN(entered(wish[name] ?? ""));
-  return html`<label class="field" key=${name}><span>${label}</span><span><input type="text" inputmode="decimal" value=${wish[name] ?? ""} placeholder=${known(usual) ? significant(usual) : ""} aria-invalid=${wrong ? "true" : undefined} onInput=${set(name)} /> ${u}</span></label>`;
+/** @param {string} name @param {string} label @param {string} u @param {number | null | undefined} usual @param {any} form @param {any} set @param {any} problem */
+function Field(name, label, u, usual, form, set, problem) {
+  const wrong = problem?.errors?.find((/** @type {any} */ each) => each.where.endsWith(name)) || Number.isNaN(entered(form[name] ?? ""));
+  return html`<label class="field" key=${name}><span>${label}</span><span><input type="text" inputmode="decimal" value=${form[name] ?? ""} placeholder=${known(usual) ? significant(usual) : ""} aria-invalid=${wrong ? "true" : undefined} onInput=${set(name)} /> ${u}</span></label>`;
 }
 
 const NUMBERS = ["mv_low", "mv_high", "pv_low", "pv_high", "sp_deviation"];
 const REQUIREMENTS = ["settling_s", "mv_peak"];
 
-/** The body of a request, and what is wrong with the fields. @param {Record<string, any>} wish */
-function bodyOf(wish) {
+/** The body of a request, and what is wrong with the fields. @param {Record<string, any>} form */
+function bodyOf(form) {
   /** @type {Record<string, any>} */
-  const body = { method: wish.method };
+  const body = { method: form.method };
   let bad = "";
-  const designed = wish.method === "fast" || wish.method === "setpoint";
-  const names = [...NUMBERS, ...(designed ? REQUIREMENTS : []), ...(wish.method === "fast" ? ["amplitude_pct"] : [])];
+  const designed = form.method === "fast" || form.method === "setpoint";
+  const names = [...NUMBERS, ...(designed ? REQUIREMENTS : []), ...(form.method === "fast" ? ["amplitude_pct"] : [])];
   for (const name of names) {
-    const value = entered(String(wish[name] ?? ""));
+    const value = entered(String(form[name] ?? ""));
     if (Number.isNaN(value)) bad = "A field is not a number.";
     else if (value !== null) body[name] = value;
   }
   if (designed) {
-    body.ms = Number(wish.ms);
-    if (wish.derivative) body.derivative = true;
-    if (wish.aim) body.aim = wish.aim;
+    body.ms = Number(form.ms);
+    if (form.derivative) body.derivative = true;
+    if (form.aim) body.aim = form.aim;
   }
-  if (wish.method === "fast" && wish.careful) body.careful = true;
-  if (wish.dry_run) body.dry_run = true;
+  if (form.method === "fast" && form.careful) body.careful = true;
+  if (form.dry_run) body.dry_run = true;
   return { body, bad };
 }
 
