@@ -15,11 +15,12 @@ from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.identification.disturbances import (
     by_bic,
     disturbance_candidates,
+    drifting,
     fit_structures,
+    lowest_bic,
     preferred,
-    started_under,
 )
-from loopwright.tuning.identification.output_error import UNDISTURBED, DisturbanceHypothesis, Fit, Fitted
+from loopwright.tuning.identification.output_error import UNDISTURBED, Fit, Fitted
 
 RIVAL_BIC = 10.0
 """Difference of BIC within which another structure is a rival: it explains the record almost as well as the best."""
@@ -55,9 +56,7 @@ def choose_structure(fit: Fit[ExperimentRecord], known: Sequence[Fitted] = ()) -
     found, others = undisturbed, list[Fitted]()
     first = min(undisturbed, key=by_bic)
     if _unexplained(fit, first):
-        found = preferred(
-            found, reduce(preferred, disturbance_candidates(fit, undisturbed, partial(_unexplained, fit), known))
-        )
+        found = preferred(undisturbed, _disturbed(fit, undisturbed, known))
     elif fit.record.excitation is Excitation.MANUAL:
         # Nothing brings PV back from a load disturbance in manual: one near a pulse hides in the model.
         with_load = disturbance_candidates(fit, undisturbed, lambda fitted: False, known)[0]
@@ -65,15 +64,24 @@ def choose_structure(fit: Fit[ExperimentRecord], known: Sequence[Fitted] = ()) -
         others = undisturbed if found is with_load else with_load
     elif _slow(fit, first):
         # The noise limits how well MV at rest is known; an error of MV at rest makes a slow plant drift.
-        drift = DisturbanceHypothesis(drift=True)
-        drifting = fit_structures(fit, drift, [*known, *started_under(drift, undisturbed)])
-        found = drifting if min(map(by_bic, drifting)) < first.bic else found
+        found = min(undisturbed, drifting(fit, undisturbed, known), key=lowest_bic)
     ranked = sorted(found, key=by_bic)
     # The record hardly shows the static gain of a slow plant, so a wrong sign alone does not rule a model out.
     ranked = [each for each in ranked if _gain_has_the_right_sign(fit, each)] or ranked
     rivals = tuple(each for each in [*ranked[1:], *others] if each.bic < ranked[0].bic + RIVAL_BIC)
     same = tuple(each for each in ranked if each.hypothesis == ranked[0].hypothesis)
     return StructureChoice(ranked[0], rivals, same)
+
+
+def _disturbed(fit: Fit[ExperimentRecord], undisturbed: list[Fitted], known: Sequence[Fitted]) -> list[Fitted]:
+    """The fits under the disturbance hypothesis that explains the record best.
+
+    A load disturbance can stand for a drift, so that a drift is tried also where one load disturbance explains the
+    record: the rest would look like a valve that sticks or a gain that differs.
+    """
+    one_load, *further = disturbance_candidates(fit, undisturbed, partial(_unexplained, fit), known)
+    drift, *two_loads = further or [drifting(fit, undisturbed, known)]
+    return reduce(preferred, two_loads, min(one_load, drift, key=lowest_bic))
 
 
 def _gain_has_the_right_sign(fit: Fit[ExperimentRecord], found: Fitted) -> bool:

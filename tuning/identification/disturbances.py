@@ -83,26 +83,37 @@ def disturbance_candidates(
     )
     if not unexplained(min(one_load, key=by_bic)):
         return [one_load]
-    drift = DisturbanceHypothesis(drift=True)
     two_loads = fit_structures(
         fit, DisturbanceHypothesis(load_disturbances=2), (*known, *_with_load(fit, one_load, known)), structures
     )
-    return [one_load, fit_structures(fit, drift, [*known, *started_under(drift, undisturbed)], structures), two_loads]
+    return [one_load, drifting(fit, undisturbed, known, structures), two_loads]
+
+
+def drifting(
+    fit: Fit[S],
+    undisturbed: list[Fitted],
+    known: Sequence[Fitted] = (),
+    structures: Sequence[Structure] = STRUCTURES,
+) -> list[Fitted]:
+    """The fits of all structures with a drift of PV; the arguments are those of `disturbance_candidates`."""
+    drift = DisturbanceHypothesis(drift=True)
+    starts = [replace(each, hypothesis=drift) for each in undisturbed]
+    return fit_structures(fit, drift, [*known, *starts], structures)
 
 
 def preferred(undisturbed: list[Fitted], disturbed: list[Fitted]) -> list[Fitted]:
     """The fits with the disturbance if their lowest BIC is at least MIN_BIC_GAIN lower, else those without."""
-    return disturbed if min(map(by_bic, disturbed)) < min(map(by_bic, undisturbed)) - MIN_BIC_GAIN else undisturbed
+    return disturbed if lowest_bic(disturbed) < lowest_bic(undisturbed) - MIN_BIC_GAIN else undisturbed
+
+
+def lowest_bic(fits: Sequence[Fitted]) -> float:
+    """The BIC of the best of these fits."""
+    return min(each.bic for each in fits)
 
 
 def by_bic(fitted: Fitted) -> float:
     """The sort key of fits: BIC, the lower the better."""
     return fitted.bic
-
-
-def started_under(hypothesis: DisturbanceHypothesis, found: Sequence[Fitted]) -> list[Fitted]:
-    """The fits without load disturbances as starts under a hypothesis that has as many searched parameters."""
-    return [replace(each, hypothesis=hypothesis) for each in found if not each.hypothesis.load_disturbances]
 
 
 def fit_structures(
