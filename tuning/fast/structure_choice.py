@@ -15,10 +15,11 @@ from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.identification.disturbances import (
     by_bic,
     disturbance_candidates,
-    drifting,
     fit_structures,
     lowest_bic,
     preferred,
+    with_drift,
+    with_one_load,
 )
 from loopwright.tuning.identification.output_error import UNDISTURBED, Fit, Fitted
 
@@ -56,32 +57,22 @@ def choose_structure(fit: Fit[ExperimentRecord], known: Sequence[Fitted] = ()) -
     found, others = undisturbed, list[Fitted]()
     first = min(undisturbed, key=by_bic)
     if _unexplained(fit, first):
-        found = preferred(undisturbed, _disturbed(fit, undisturbed, known))
+        one_load, drift, *two = disturbance_candidates(fit, undisturbed, partial(_unexplained, fit), known)
+        found = preferred(undisturbed, reduce(preferred, two, min(one_load, drift, key=lowest_bic)))
     elif fit.record.excitation is Excitation.MANUAL:
         # Nothing brings PV back from a load disturbance in manual: one near a pulse hides in the model.
-        with_load = disturbance_candidates(fit, undisturbed, lambda fitted: False, known)[0]
-        found = preferred(undisturbed, with_load)
-        others = undisturbed if found is with_load else with_load
+        one_load = with_one_load(fit, undisturbed, known)
+        found = preferred(undisturbed, one_load)
+        others = undisturbed if found is one_load else one_load
     elif _slow(fit, first):
         # The noise limits how well MV at rest is known; an error of MV at rest makes a slow plant drift.
-        found = min(undisturbed, drifting(fit, undisturbed, known), key=lowest_bic)
+        found = min(undisturbed, with_drift(fit, undisturbed, known), key=lowest_bic)
     ranked = sorted(found, key=by_bic)
     # The record hardly shows the static gain of a slow plant, so a wrong sign alone does not rule a model out.
     ranked = [each for each in ranked if _gain_has_the_right_sign(fit, each)] or ranked
     rivals = tuple(each for each in [*ranked[1:], *others] if each.bic < ranked[0].bic + RIVAL_BIC)
     same = tuple(each for each in ranked if each.hypothesis == ranked[0].hypothesis)
     return StructureChoice(ranked[0], rivals, same)
-
-
-def _disturbed(fit: Fit[ExperimentRecord], undisturbed: list[Fitted], known: Sequence[Fitted]) -> list[Fitted]:
-    """The fits under the disturbance hypothesis that explains the record best.
-
-    A load disturbance can stand for a drift, so that a drift is tried also where one load disturbance explains the
-    record: the rest would look like a valve that sticks or a gain that differs.
-    """
-    one_load, *further = disturbance_candidates(fit, undisturbed, partial(_unexplained, fit), known)
-    drift, *two_loads = further or [drifting(fit, undisturbed, known)]
-    return reduce(preferred, two_loads, min(one_load, drift, key=lowest_bic))
 
 
 def _gain_has_the_right_sign(fit: Fit[ExperimentRecord], found: Fitted) -> bool:

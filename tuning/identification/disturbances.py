@@ -1,7 +1,7 @@
 """Fits every model structure under each disturbance hypothesis: none, one or two load disturbances, or a drift.
 
-A residual larger than the noise is explained first by one step-shaped load disturbance at a free time, then by two, or
-by a drift of PV. A disturbance hypothesis is accepted only if it lowers BIC by MIN_BIC_GAIN.
+A residual larger than the noise is explained first by one step-shaped load disturbance at a free time or by a drift of
+PV, then by two load disturbances. A disturbance hypothesis is accepted only if it lowers BIC by MIN_BIC_GAIN.
 """
 
 from __future__ import annotations
@@ -70,26 +70,37 @@ def disturbance_candidates(
 ) -> list[list[Fitted]]:
     """The fits of all structures under disturbance hypotheses, one list for each hypothesis.
 
-    The first hypothesis is one load disturbance. A drift and two load disturbances are tried only where the best fit
-    with one load disturbance leaves a residual that is not explained.
+    The first hypotheses are one load disturbance and a drift; each can stand for a little of the other, and what is
+    left then looks like a plant that is not linear. Two load disturbances are tried only where the best fit of these
+    leaves a residual that is not explained.
 
     undisturbed: the fits without a disturbance.
     unexplained: tells whether a fit leaves a residual that is not explained.
     known: fits of an earlier part of the same record, which are further starts of the search.
     structures: the structures that are fitted.
     """
-    one_load = fit_structures(
-        fit, DisturbanceHypothesis(load_disturbances=1), (*known, *_with_load(fit, undisturbed, known)), structures
-    )
-    if not unexplained(min(one_load, key=by_bic)):
-        return [one_load]
+    one_load = with_one_load(fit, undisturbed, known, structures)
+    drift = with_drift(fit, undisturbed, known, structures)
+    if not unexplained(min((*one_load, *drift), key=by_bic)):
+        return [one_load, drift]
     two_loads = fit_structures(
         fit, DisturbanceHypothesis(load_disturbances=2), (*known, *_with_load(fit, one_load, known)), structures
     )
-    return [one_load, drifting(fit, undisturbed, known, structures), two_loads]
+    return [one_load, drift, two_loads]
 
 
-def drifting(
+def with_one_load(
+    fit: Fit[S],
+    undisturbed: list[Fitted],
+    known: Sequence[Fitted] = (),
+    structures: Sequence[Structure] = STRUCTURES,
+) -> list[Fitted]:
+    """The fits of all structures with one load disturbance; the arguments are those of `disturbance_candidates`."""
+    started = _with_load(fit, undisturbed, known)
+    return fit_structures(fit, DisturbanceHypothesis(load_disturbances=1), (*known, *started), structures)
+
+
+def with_drift(
     fit: Fit[S],
     undisturbed: list[Fitted],
     known: Sequence[Fitted] = (),
@@ -97,8 +108,7 @@ def drifting(
 ) -> list[Fitted]:
     """The fits of all structures with a drift of PV; the arguments are those of `disturbance_candidates`."""
     drift = DisturbanceHypothesis(drift=True)
-    starts = [replace(each, hypothesis=drift) for each in undisturbed]
-    return fit_structures(fit, drift, [*known, *starts], structures)
+    return fit_structures(fit, drift, [*known, *(replace(each, hypothesis=drift) for each in undisturbed)], structures)
 
 
 def preferred(undisturbed: list[Fitted], disturbed: list[Fitted]) -> list[Fitted]:

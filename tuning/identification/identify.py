@@ -117,7 +117,8 @@ class Identified:
     standard_errors: the standard errors of the parameters by the same names.
     covariance: the covariance of the parameters in the same order, shape (parameters, parameters).
     loads: the load disturbances that the record shows.
-    drift: True if PV drifted at a steady rate, which the fit allows for.
+    drift: True if PV drifted at a steady rate, which the fit allows for. The drift of an integrating plant is a load
+    disturbance at its input; a note says so instead.
     whiteness: the Ljung-Box p-value of the residual; below 0.001 the residual is not white noise.
     explained: True if the residual is white or negligible (0.15 % of the range of PV, or the rounding error of PV).
     t, u, y: the record: times, s, MV, MV units, and PV, PV units, all of shape (N,).
@@ -257,6 +258,8 @@ def _result(problem: IdentificationProblem, best: Fitted, ranked: Sequence[Fitte
     residual = unit * best.linear.residual
     ratio = float(np.linalg.norm(residual) / np.linalg.norm(record.y - record.y.mean()))
     of_loads = [each for each in problem.load_disturbances(best) if not _at_the_start(problem, each[0])]
+    # a steady load at the input of an integrating plant makes PV drift
+    under_load = best.hypothesis.drift and best.structure.integrating
     found = Identified(
         model=problem.model(best),
         fit_pct=100.0 * (1.0 - ratio),
@@ -271,7 +274,7 @@ def _result(problem: IdentificationProblem, best: Fitted, ranked: Sequence[Fitte
             )
             for at, off in of_loads
         ),
-        drift=best.hypothesis.drift,
+        drift=best.hypothesis.drift and not under_load,
         whiteness=problem.whiteness(best),
         explained=problem.explains(best),
         t=np.asarray(t0 + record.Ts * np.arange(len(record.y)), dtype=np.float64),
@@ -287,7 +290,8 @@ def _result(problem: IdentificationProblem, best: Fitted, ranked: Sequence[Fitte
         ),
         notes=(),
     )  # fmt: skip
-    at_rest = not best.hypothesis.not_at_rest_initially and len(of_loads) == best.hypothesis.load_disturbances
+    initially = best.hypothesis.not_at_rest_initially or under_load
+    at_rest = not initially and len(of_loads) == best.hypothesis.load_disturbances
     return replace(found, notes=tuple(_notes(problem, best, ranked, found, at_rest)))
 
 

@@ -81,6 +81,18 @@ def test_a_drift_is_found() -> None:
     assert error_near_the_crossover(THREE_LAGS, fit.model(chosen.best)) < 0.05
 
 
+@pytest.mark.parametrize("name", BENCHES)
+@pytest.mark.parametrize("part", [0.05, 0.2])
+def test_a_slow_drift_is_not_taken_for_a_load_disturbance(name: str, part: float) -> None:
+    bench = BENCHES[name]
+    undisturbed = record(bench)
+    drift = part * undisturbed.output_range / (len(undisturbed.u) - undisturbed.listened)
+    fit = Fit(record(bench, 0.01 * undisturbed.output_range, drift=drift))
+    best = choose_structure(fit).best
+    assert best.hypothesis == DisturbanceHypothesis(drift=True)
+    assert error_near_the_crossover(bench, fit.model(best)) < 0.03
+
+
 def test_faster_sampling_is_averaged_and_finds_the_same_plant() -> None:
     slow = Bench(THREE_LAGS.num, THREE_LAGS.den, THREE_LAGS.L, THREE_LAGS.Ts / 2.0)
     evidence = record(slow, 0.01 * record(slow).output_range)
