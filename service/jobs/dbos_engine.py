@@ -53,6 +53,17 @@ def without_traceback(record: logging.LogRecord) -> bool:
     return True
 
 
+def of_a_closed_engine(record: logging.LogRecord) -> bool:
+    """Says in one line that a job outlasted the engine, which DBOS logs as an exception of its own: the job is in the
+    service's tables, and the next start ends its workflow."""
+    if record.exc_info and _run is None:
+        record.levelno, record.levelname = logging.INFO, "INFO"
+        record.msg = "a job outlasted the engine, the next start goes on with it (%s)"
+        record.args = (record.exc_info[1],)
+        record.exc_info = record.exc_text = None
+    return True
+
+
 class DurableEngine:
     """The engine on DBOS.
 
@@ -92,7 +103,8 @@ class DurableEngine:
         }
         DBOS(config=config)
         logging.getLogger("dbos").setLevel(logging.WARNING)
-        logging.getLogger("dbos").addFilter(without_traceback)
+        for each in (without_traceback, of_a_closed_engine):
+            logging.getLogger("dbos").addFilter(each)
         DBOS.listen_queues(list(queues))
         DBOS.launch()
         for name, at_once in queues.items():
@@ -131,12 +143,12 @@ class DurableEngine:
 
     def close(self) -> None:
         global _run
+        _run = None  # a job that the engine begins from now on is left to the next start
         if self._launched:
             self._launched = False
             DBOS.destroy()
             if self._own is not None:
                 checkpoint(self._own)
-        _run = None
         self._damage.close()
         if self._own is not None:
             self._own.dispose()

@@ -212,10 +212,6 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         # Bound before anything is started or opened: a port in use then gives one sentence, not a half-started service.
         listener = stack.enter_context(listen(setup.bind, setup.port))
         pool = stack.enter_context(closing(Pool(setup.computing)))
-        if tune is None:
-            pool.submit(
-                ComputationKind.LIVE, os.getpid
-            )  # loads the fork server, so that the first computation of a loop does not wait
         store = stack.enter_context(closing(Store(setup.data, setup.database, setup.host or LOCAL)))
         webhooks = Webhooks(site.webhooks, setup.loops_file.parent, store, setup.url)
         keyring = Keyring(store.engine) if setup.auth or not local else None
@@ -225,6 +221,10 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
                 f"keys are asked for on {setup.bind} and there is none; make one with: "
                 f"loopwright key create NAME --scope admin {where}"
             )
+        if tune is None:
+            # Loads the fork server, so that the first computation of a loop does not wait. Data folder and keys come
+            # first, because a start that is refused would wait for the fork server to end.
+            pool.submit(ComputationKind.LIVE, os.getpid)
         policy = Policy(keyring, setup.limits, local_only=True)
         engine = DurableEngine(setup.data, store.engine if store.shared else None, store.host, setup.poll_s)
         station = Station(setup.node)

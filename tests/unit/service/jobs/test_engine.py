@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -110,3 +111,27 @@ def test_a_host_runs_what_is_on_its_own_queues_only(make: Make) -> None:
     engine = make("b")
     engine.launch(runs_of_b, {"b:bus": 8})
     assert runs_of_b.until(1) == ["for b"] and runs.ids == ["for a"]
+
+
+def test_a_job_that_outlasts_the_engine_is_said_in_one_line(make: Make, caplog: pytest.LogCaptureFixture) -> None:
+    engine, runs = make("a"), Runs()
+    engine.launch(runs, {"a:bus": 1})
+    engine_log = logging.getLogger("dbos")
+    engine_log.addHandler(caplog.handler)
+    try:
+        runs.hold.clear()
+        engine.enqueue("1", "a:bus")
+        runs.until(1)
+        engine.close()
+        runs.hold.set()
+        deadline = time.monotonic() + 120
+        while not caplog.records and time.monotonic() < deadline:
+            time.sleep(0.01)
+    finally:
+        engine_log.removeHandler(caplog.handler)
+    assert [record.exc_info for record in caplog.records] == [None]
+    assert caplog.records[0].getMessage().startswith("a job outlasted the engine, the next start goes on with it (")
+    # and the next start runs it again
+    again = make("a")
+    again.launch(runs, {"a:bus": 1})
+    assert runs.until(2) == ["1", "1"]

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from loopwright.protocol.profile import TUNER_NODE
 from loopwright.service.cli.main import app
+from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.server import serving
 from loopwright.service.store.store import FolderInUse
@@ -31,6 +32,19 @@ def test_a_database_that_cannot_be_used_is_said_in_words(tmp_path: Path, options
     ended = CliRunner().invoke(app, ["serve", *place, *options])
     assert ended.exit_code == 2 and words in ended.output
     assert "secret" not in ended.output and "Traceback" not in ended.output
+
+
+def test_a_start_that_is_refused_begins_no_computation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its end would wait for the fork server, on a busy machine for longer than the pool waits."""
+    begun: list[object] = []
+    monkeypatch.setattr(Pool, "submit", lambda pool, *work: begun.append(work))
+    loops = tmp_path / "loops.yaml"
+    loops.write_text(yaml.safe_dump({"loops": [loop_entry()]}))
+    (tmp_path / "data").write_text("a file where the folder should be")
+    place = ["--loops", str(loops), "--data", str(tmp_path / "data"), "--port", "0"]
+    ended = CliRunner().invoke(app, ["serve", *place])
+    assert ended.exit_code == 2 and "it is a file" in ended.output
+    assert begun == []
 
 
 @pytest.mark.parametrize("node", ["0", "128", "x", "-3"])
