@@ -29,8 +29,9 @@ _LOOK_S = 0.5
 _FINISH_S = 3.0
 _SAY_AGAIN_S = 60.0
 _WRITING_S = 1.0
-_HANGS_S = 30.0
-"""Wall time without a report, of which there is one a second, after which the process is ended, s."""
+_STARTS_S, _HANGS_S = 180.0, 30.0
+"""Wall time without a report after which the process is ended, s: without the first one, before which it loads at its
+low priority, and without another one, of which there is one a second."""
 NICENESS = 10
 """Priority of the process: its imports and its work make way for the sessions of the service."""
 ANSWER_S = 3.0
@@ -199,16 +200,16 @@ class ListeningProcess:
         """Receives messages until the process has reported the rest. Raises EOFError, OSError where it has died, and
         _Hangs."""
         give_up: float | None = None
-        heard_at = time.monotonic()
+        heard_at, patience_s = time.monotonic(), _STARTS_S
         while give_up is None or time.monotonic() < give_up:
             if give_up is None and self._over.is_set():
                 give_up = time.monotonic() + _FINISH_S
                 self._finish()
             if not connection.poll(_LOOK_S):
-                if time.monotonic() - heard_at > _HANGS_S:
+                if time.monotonic() - heard_at > patience_s:
                     raise _Hangs
                 continue
-            message, heard_at = connection.recv(), time.monotonic()
+            message, heard_at, patience_s = connection.recv(), time.monotonic(), _HANGS_S
             if isinstance(message, HistoryAnswer):
                 with self._guard:
                     asked = self._asked.pop(message.number, None)
