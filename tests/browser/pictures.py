@@ -1,6 +1,6 @@
 """Makes the pictures of docs/page.md from a live service: python -m tests.browser.pictures [FOLDER] [NAME ...]
 
-It takes some ten minutes: the plants run in real time, so that what is shown as five minutes is five minutes.
+It takes some three minutes, ten on a busy machine: the plants run in real time.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from tests.browser import person
 from tests.browser.conftest import OPTIONS
 from tests.browser.fleet import Fleet, Member, locked_service
 from tests.browser.pages import PATIENCE_MS
+from tests.browser.trend import columns
+from tests.unit.service.processes import until
 
 FOLDER = Path(__file__).parents[2] / "docs" / "page"
 LAPTOP = {"width": 1440, "height": 900}
@@ -33,6 +35,10 @@ TALL = {"width": 1440, "height": 1500}
 PHONE = {"width": 390, "height": 844}
 PATIENCE_S = 600.0
 """A busy machine computes slowly, and the plants do not wait for it."""
+WAVE_S = 24.0
+"""Plant time of the relay that is shown, more than an ultimate period of the loop."""
+MANY_COLUMNS = 200
+"""Of pixels in which PV is drawn: the past of the trend has come."""
 COLOURS, VIVID = 256, 48
 """Of a picture: the most frequent ones, which are those of the page, and of what is vivid, which is rare, as many."""
 OUTSIDE = MappingProxyType({"pv_limits": {"low": 50.2, "high": 52.0}})
@@ -146,13 +152,14 @@ def photograph(fleet: Fleet, camera: Photographer, jobs: dict[str, str], locked:
 
     under_test = {tag: fleet.retune(tag, requested_by="A. Lind") for tag in UNDER_TEST}
     first = under_test[UNDER_TEST[0]]
-    fleet.until(first, lambda job: job["stage"] == "relay")
+    began = fleet.until(first, lambda job: job["stage"] == "relay")["plant_time_s"]
     # Some switches: the wave can be seen.
-    fleet.until(first, lambda job: job["plant_time_s"] > 34.0 or job["stage"] != "relay")
+    fleet.until(first, lambda job: job["plant_time_s"] > began + WAVE_S or job["stage"] != "relay")
 
     def testing(page: Page) -> None:
         expect(person.under_test(page).locator(person.STEP)).to_be_visible()
         expect(person.face(page, UNDER_TEST[0]).locator(".big")).not_to_have_text(person.DASH)
+        until(lambda: len(columns(page, UNDER_TEST[0])[0]) > MANY_COLUMNS)
 
     def overview(page: Page) -> None:
         expect(page.locator(".spark path").first).to_be_attached()

@@ -45,9 +45,9 @@ class Gap:
     ago_s: float
 
 
-def columns(page: Page) -> tuple[list[int], int]:
+def columns(page: Page, tag: str = TAG) -> tuple[list[int], int]:
     """The columns in which PV is drawn, from the left, and how many there are."""
-    drawn = page.get_by_role("img", name=f"PV and set-point of {TAG}").evaluate(COLUMNS)
+    drawn = page.get_by_role("img", name=f"PV and set-point of {tag}").evaluate(COLUMNS)
     return drawn["found"], drawn["width"]
 
 

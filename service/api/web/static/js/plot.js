@@ -24,10 +24,10 @@ function ticks(low, high, distance) {
 }
 
 /**
- * A range of y that follows the data but is never narrower than `least`.
- * @param {Iterable<ArrayLike<number>>} columns @param {number} least @returns {[number, number]}
+ * A range of y that follows the data but is never narrower than `minimum`.
+ * @param {Iterable<ArrayLike<number>>} columns @param {number} minimum @returns {[number, number]}
  */
-export function yRange(columns, least) {
+export function yRange(columns, minimum) {
   let low = Infinity;
   let high = -Infinity;
   for (const column of columns) {
@@ -37,9 +37,9 @@ export function yRange(columns, least) {
       if (value > high) high = value;
     }
   }
-  if (!(low <= high)) return [0, least];
+  if (!(low <= high)) return [0, minimum];
   const middle = (low + high) / 2;
-  const half = Math.max((high - low) * 0.54, least / 2);
+  const half = Math.max((high - low) * 0.54, minimum / 2);
   return [middle - half, middle + half];
 }
 
@@ -132,7 +132,7 @@ export function makePlot(where, options) {
             u.ctx.beginPath();
             u.ctx.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height);
             u.ctx.clip();
-            options.beneath?.(u, u.ctx);
+            if (u.data[0].length) options.beneath?.(u, u.ctx); // without data the scale says nothing of the limits
             u.ctx.restore();
           },
         ],
