@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -31,6 +32,7 @@ LAPTOP = {"width": 1440, "height": 900}
 HIGHER = {"width": 1440, "height": 1000}
 LOW = {"width": 1440, "height": 480}
 SMALL = {"width": 720, "height": 440}
+WITH_FORM = {"width": 1440, "height": 1180}
 TALL = {"width": 1440, "height": 1500}
 PHONE = {"width": 390, "height": 844}
 PATIENCE_S = 600.0
@@ -45,13 +47,14 @@ OUTSIDE = MappingProxyType({"pv_limits": {"low": 50.2, "high": 52.0}})
 RESULT, WAITS, REFUSED, ACCEPTED = "TIC-101", "TIC-310", "FIC-220", ("PIC-110", "FIC-120")
 CHANGED = ACCEPTED[0]
 """Its gains are changed by hand at the controller."""
+UNTUNED = "LIC-130"
 UNDER_TEST = "TIC-102", "TIC-201"
 FLEET = (
     Member(RESULT, "Distillation", "Reboiler outlet temperature", "degC"),
     Member("TIC-102", "Distillation", "Column top temperature", "degC", "model-41", 20.0, 12.0, 50.3),
     Member("PIC-110", "Distillation", "Column head pressure", "mbar", "model-12", 60.0, 2.5, 50.4),
     Member("FIC-120", "Distillation", "Reflux flow", "m3/h", "model-14", 70.0, 1.5, 49.6),
-    Member("LIC-130", "Distillation", "Sump level", "%", "sopdt", 100.0, 12.0, 50.0, 0.004),
+    Member(UNTUNED, "Distillation", "Sump level", "%", "sopdt", 100.0, 12.0, 50.0, 0.004),
     Member("TIC-201", "Reactor", "Jacket temperature", "degC", "model-20", 12.0, 10.0, 50.2),
     Member("QIC-210", "Reactor", "Conductivity after neutralising", "mS/cm", "model-30", 30.0, 6.0, 49.8),
     Member(REFUSED, "Reactor", "Feed A", "m3/h", "model-14", 30.0, 2.0, 50.2, 0.03),
@@ -134,6 +137,15 @@ def photograph(fleet: Fleet, camera: Photographer, jobs: dict[str, str], locked:
     def abnormal(page: Page) -> None:
         expect(page.get_by_role("row").nth(3)).to_be_visible()
 
+    def asked(page: Page) -> None:
+        form = person.form(page)
+        expect(form).not_to_contain_text("Asking what would happen")
+        page.get_by_role("button", name="More options").click()
+
+    def many(page: Page) -> None:
+        page.get_by_role("textbox", name="Loops").fill("*IC-1*")
+        expect(page.get_by_role("button", name=re.compile(r"Retune \d loops"))).to_be_visible()
+
     def signed_out(page: Page) -> None:
         expect(page.get_by_label("API key")).to_be_focused()
 
@@ -146,6 +158,9 @@ def photograph(fleet: Fleet, camera: Photographer, jobs: dict[str, str], locked:
     camera.take("refused", f"/ui{jobs[REFUSED]}", refused)
     camera.take("jobs", "/ui/jobs", lambda page: expect(page.get_by_role("row")).to_have_count(len(jobs) + 1), LOW)
     camera.take("abnormal", "/ui/alarms", abnormal, LOW)
+    camera.take("retune", f"/ui/loops/{UNTUNED}", asked, WITH_FORM)
+    camera.take("retunes", "/ui/retunes", many, LOW)
+    camera.take("log", "/ui/log", lambda page: expect(page.get_by_role("row").nth(len(jobs))).to_be_visible(), LOW)
     camera.url, url = locked, camera.url
     camera.take("sign-in", "/ui/", signed_out, SMALL)
     camera.url = url
