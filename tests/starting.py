@@ -10,10 +10,10 @@ import pytest
 
 STARTS_A_SERVICE = "starts_a_service"
 """The property of a test in the report; its value is pytest's name of the test."""
-_SERVING = frozenset({"serve", "demo"})
-"""Commands of `loopwright` that run a service."""
-FORKED = "tests.unit.service.forked"
-"""The audit event of a service that is forked from a process which has everything loaded."""
+_SERVING = frozenset({"serve", "demo", "tests.unit.service.gateway"})
+"""Commands of `loopwright` that run a service, and a module that is one."""
+FORKED = "tests.forked"
+"""The audit event of a process that is forked from one which has everything loaded."""
 
 _started: list[Sequence[object]] = []
 
@@ -22,7 +22,7 @@ def _hear(event: str, arguments: tuple[object, ...]) -> None:
     if event == "subprocess.Popen" and isinstance(arguments[1], list | tuple):
         _started.append(arguments[1])
     elif event == FORKED:
-        _started.append(("serve",))
+        _started.append(arguments)
 
 
 sys.addaudithook(_hear)

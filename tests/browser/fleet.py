@@ -15,8 +15,8 @@ import yaml
 
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, ParameterCommand
 from loopwright.protocol.tuner import Tuner
-from loopwright.service.cli.child_process import ChildProcess
 from tests.browser.site import Site, free_port
+from tests.forked import ForkedProcess
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,6 @@ def locked_service(stack: ExitStack, folder: Path) -> str:
     create = ("key", "create", "operator", "--scope", "operate", "--data", str(data))
     subprocess.run([sys.executable, "-m", "loopwright.service", *create], check=True, capture_output=True)
     serve = ("serve", "--loops", str(loops), "--data", str(data), "--port", "0", "--auth")
-    service = ChildProcess("service", ("loopwright.service", *serve), folder / "locked.log")
+    service = ForkedProcess("service", ("loopwright.service", *serve), folder / "locked.log")
     stack.callback(service.stop)
     return service.wait_ready().split()[1]

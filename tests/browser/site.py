@@ -10,8 +10,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from loopwright.service.cli.child_process import ChildProcess
 from tests.e2e.plantsite import MODEL_14, Plantsite
+from tests.forked import ForkedProcess
 
 CASE = replace(MODEL_14, ts=0.05)
 TAG = "TIC-101"
@@ -43,7 +43,7 @@ class Site(Plantsite):
         if bus is None:
             hub_port = free_port()
             self._hub_options = ("loopwright.protocol.hub", "--port", str(hub_port))
-            self.hub = ChildProcess("hub", self._hub_options, folder / "hub.log")
+            self.hub = ForkedProcess("hub", self._hub_options, folder / "hub.log")
             stack.callback(self.hub.stop)
             bus = self.hub.wait_ready().split()[1]
         port = ("--port", str(free_port()))

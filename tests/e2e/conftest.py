@@ -7,8 +7,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from loopwright.service.cli.child_process import ChildProcess
 from tests.e2e.plantsite import HUB, ON_VCAN, VCAN
+from tests.forked import ForkedProcess
 
 
 @pytest.fixture(scope="module", params=[HUB, ON_VCAN])
@@ -17,7 +17,7 @@ def bus(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     with ExitStack() as stack:
         if request.param == HUB:
             log = tmp_path_factory.mktemp("hub") / "hub.log"
-            hub = ChildProcess("hub", ("loopwright.protocol.hub", "--port", "0"), log)
+            hub = ForkedProcess("hub", ("loopwright.protocol.hub", "--port", "0"), log)
             stack.callback(hub.stop)
             yield hub.wait_ready().split()[1]
         else:

@@ -19,6 +19,7 @@ from loopwright.service.cli.child_process import ChildProcess
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.plan import Mode
 from tests.e2e.plantsite import MODEL_14
+from tests.forked import ForkedProcess
 from tests.unit.service.postgres import Server, binaries
 from tests.unit.service.processes import until
 
@@ -65,7 +66,7 @@ class GatewaySite:
         self.other.wait_ready(180)  # its loop is in the database
 
     def _run(self, name: str, *arguments: str) -> ChildProcess:
-        process = ChildProcess(name, arguments, self._folder / f"{name}.log")
+        process = ForkedProcess(name, arguments, self._folder / f"{name}.log")
         self._stack.callback(process.stop)
         return process
 

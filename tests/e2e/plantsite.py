@@ -20,6 +20,7 @@ from loopwright.service.cli.child_process import ChildProcess
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.plan import Mode
+from tests.forked import ForkedProcess
 from tests.pulse_phases import Phase, PulseWatch
 
 VCAN = "socketcan:vcan0"
@@ -143,9 +144,9 @@ class Plantsite:
         where = ("--bus", self.bus, "--ts", str(case.ts))
         self.controller = self.launch("controller", self.controller_module, *where, *gains, *kept)
 
-    def launch(self, name: str, *arguments: str) -> ChildProcess:
+    def launch(self, name: str, *arguments: str, kind: type[ChildProcess] = ForkedProcess) -> ChildProcess:
         """Starts a process and does not wait for it."""
-        process = ChildProcess(name, arguments, self._folder / f"{name}.log")
+        process = kind(name, arguments, self._folder / f"{name}.log")
         self._stack.callback(process.stop)
         return process
 
@@ -166,7 +167,9 @@ class Plantsite:
         loops = self._folder / "loops.yaml"
         loops.write_text(yaml.safe_dump({"loops": [loop, *(loop | change for change in self._more_loops)]}))
         serve = ("serve", "--loops", str(loops), "--data", str(self.data), "--port", "0", *self._served_with)
-        return self.launch("service", *self._launcher, "loopwright.service", *serve)
+        # A launcher changes what is imported after it.
+        kind = ChildProcess if self._launcher else ForkedProcess
+        return self.launch("service", *self._launcher, "loopwright.service", *serve, kind=kind)
 
     def _connect(self) -> None:
         self.service = self._service

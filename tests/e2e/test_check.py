@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
-from loopwright.service.cli.child_process import ChildProcess
+from tests.forked import ForkedProcess
 
 HEATER = {"K": 0.8, "T_s": 120, "L_s": 15, "mv": 40, "pv": 65}
 LOOP = {
@@ -31,7 +31,7 @@ def heater(bus: str, tmp_path: Path) -> Iterator[str]:
             ("plant", "--model", json.dumps(HEATER), "--speed", "10"),
         ):
             command = ("loopwright.service", name, "--bus", bus, "--ts", "1", *options)
-            process = ChildProcess(name, command, tmp_path / f"{name}.log")
+            process = ForkedProcess(name, command, tmp_path / f"{name}.log")
             stack.callback(process.stop)
             process.wait_ready()
         yield bus

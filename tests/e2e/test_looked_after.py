@@ -14,8 +14,8 @@ import pytest
 
 from loopwright.protocol.bus import open_bus
 from loopwright.protocol.profile import NMT_FRAME, NMT_ID, NmtCommand
-from loopwright.service.cli.child_process import ChildProcess
 from tests.e2e.plantsite import MODEL_14, STAGES, TAG, Plantsite
+from tests.forked import ForkedProcess
 
 pytestmark = pytest.mark.timeout(300)
 CONTROLLER = 0x20
@@ -24,7 +24,7 @@ CONTROLLER = 0x20
 @pytest.fixture
 def here(tmp_path: Path) -> Iterator[Plantsite]:
     with ExitStack() as stack:
-        hub = ChildProcess("hub", ("loopwright.protocol.hub", "--port", "0"), tmp_path / "hub.log")
+        hub = ForkedProcess("hub", ("loopwright.protocol.hub", "--port", "0"), tmp_path / "hub.log")
         stack.callback(hub.stop)
         site = Plantsite(stack, tmp_path, MODEL_14, hub.wait_ready().split()[1])
         site.at_rest(5.0)

@@ -12,6 +12,7 @@ import yaml
 
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
 from loopwright.service.cli.child_process import ChildProcess
+from tests.forked import ForkedProcess
 from tests.unit.service.fakes import TAG, loop_entry
 from tests.unit.service.processes import descendants, until
 
@@ -29,7 +30,7 @@ class Site:
         self.serve()
 
     def run(self, name: str, *arguments: str) -> ChildProcess:
-        process = ChildProcess(name, arguments, self._folder / f"{name}.log")
+        process = ForkedProcess(name, arguments, self._folder / f"{name}.log")
         self._stack.callback(process.stop)
         process.wait_ready(180)
         return process

@@ -16,8 +16,8 @@ from loopwright.service.cli.child_process import ChildProcess
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
+from tests.forked import ForkedProcess
 from tests.unit.service.fakes import TAG
-from tests.unit.service.forked import ForkedGateway
 from tests.unit.service.gateway import HOME, read_loop
 
 pytestmark = pytest.mark.timeout(300)  # processes that start slowly on a busy machine
@@ -44,7 +44,7 @@ class Door:
                     )
                 )  # fmt: skip
         arguments = [str(folder), f"--tag={TAG}", f"--on-bus={SILENT}", f"--limits={json.dumps(limits)}"]
-        self.process = ForkedGateway(
+        self.process = ForkedProcess(
             "gateway", ("tests.unit.service.gateway", *arguments, *(["--auth"] if auth else [])), folder / "gateway.log"
         )
         stack.callback(self.process.stop)

@@ -19,8 +19,8 @@ from sqlalchemy.orm import Session
 from loopwright.service.cli.child_process import ChildProcess, NotReady
 from loopwright.service.store.database import WAIT_S
 from loopwright.service.store.tables import EventRow
+from tests.forked import ForkedProcess
 from tests.unit.service.fakes import NEW, OLD, TAG
-from tests.unit.service.forked import ForkedGateway
 from tests.unit.service.gateway import HOME, STAGES, read_loop
 from tests.unit.service.postgres import Server
 from tests.unit.service.processes import until
@@ -54,7 +54,7 @@ class Gateway:
 
     def launch(self, *more: str) -> ChildProcess:
         arguments = ("tests.unit.service.gateway", str(self.folder), *self._arguments, *more)
-        process = ForkedGateway("gateway", arguments, self.folder / "gateway.log")
+        process = ForkedProcess("gateway", arguments, self.folder / "gateway.log")
         self._stack.callback(process.stop)
         return process
 
@@ -158,7 +158,7 @@ def test_a_second_service_on_the_same_data_is_told_who_has_it(
         other = tmp_path / "other"
         other.mkdir()
         arguments = ("tests.unit.service.gateway", str(other), f"--tag={TAG}", f"--database={database}")
-        second = ForkedGateway("second", arguments, tmp_path / "second.log")
+        second = ForkedProcess("second", arguments, tmp_path / "second.log")
         stack.callback(second.stop)
     with pytest.raises(NotReady) as refused:
         second.wait_ready(180)
@@ -285,7 +285,7 @@ def another(stack: ExitStack, folder: Path, database: str) -> ChildProcess:
     """A gateway of the same name with a data folder of its own."""
     (folder / "other").mkdir()
     arguments = ("tests.unit.service.gateway", str(folder / "other"), f"--tag={TAG}", f"--database={database}")
-    process = ForkedGateway("another", arguments, folder / "another.log")
+    process = ForkedProcess("another", arguments, folder / "another.log")
     stack.callback(process.stop)
     return process
 

@@ -1,9 +1,10 @@
-"""Gateways forked from one process that has everything loaded: a start costs a tenth of the processor time.
+"""Services and devices forked from one process that has everything loaded: a start costs a tenth of the processor time.
 
-    python -m tests.unit.service.forked FD
+    python -m tests.forked FD
 
 Each is a process of its own with its own log, and is killed like any other. What a start of the service itself does
-until it is ready is the subject of test_start.py and test_stop.py, which start it anew.
+until it is ready is the subject of test_start.py and test_stop.py, which start it anew, as the demo and the transcripts
+do with all of the processes.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import atexit
 import gc
 import json
 import os
+import runpy
 import select
 import signal
 import socket
@@ -20,10 +22,18 @@ import sys
 import threading
 from collections.abc import Sequence
 from functools import cache
+from importlib import import_module
 
 from loopwright.service.cli.child_process import ChildProcess
 
-MODULE = "tests.unit.service.gateway"
+_LOADED = (
+    "loopwright.protocol.hub",
+    "loopwright.controller.__main__",
+    "loopwright.plantsim.__main__",
+    "loopwright.service.cli.main",
+    "loopwright.service.server.serving",
+)
+"""What is imported before a process is forked."""
 _MESSAGE = 65_536
 _KILLED = -signal.SIGKILL
 
@@ -49,7 +59,7 @@ class _Forked:
             try:
                 self.returncode = int(self._status.recv(_MESSAGE) or _KILLED)
             except (BlockingIOError, TimeoutError):
-                raise subprocess.TimeoutExpired(MODULE, timeout or 0.0) from None
+                raise subprocess.TimeoutExpired(__name__, timeout or 0.0) from None
             self._status.close()
         return self.returncode
 
@@ -64,18 +74,17 @@ class _Forked:
         self.send_signal(signal.SIGKILL)
 
 
-class ForkedGateway(ChildProcess):
-    """tests.unit.service.gateway with these arguments."""
+class ForkedProcess(ChildProcess):
+    """python -m MODULE ARGS as a ChildProcess, which does not import again what is loaded."""
 
     def _start(self, arguments: Sequence[str], own_group: bool) -> subprocess.Popen[str]:
-        assert arguments[0] == MODULE and not own_group
-        sys.audit(__name__)  # tests.starting hears it
+        assert not own_group
+        sys.audit(__name__, *arguments)  # tests.starting hears it
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         read, write = os.pipe()
         with theirs:
-            socket.send_fds(
-                _parent(), [json.dumps(arguments[1:]).encode()], [write, self._errors.fileno(), theirs.fileno()]
-            )
+            asked = json.dumps([os.getcwd(), dict(os.environ), *arguments]).encode()
+            socket.send_fds(_parent(), [asked], [write, self._errors.fileno(), theirs.fileno()])
         os.close(write)
         return _Forked(ours, read)  # type: ignore[return-value]  # it has what ChildProcess uses
 
@@ -128,7 +137,11 @@ def arguments_of_a_fork(asked: socket.socket) -> list[str]:
                 opened.close()
             for fd in (output, errors):
                 os.close(fd)
-            return [str(each) for each in json.loads(message)]
+            folder, environment, *arguments = json.loads(message)
+            os.chdir(folder)
+            os.environ.clear()
+            os.environ.update(environment)
+            return list(map(str, arguments))
         for fd in (output, errors):
             os.close(fd)
         statuses[pid] = end
@@ -139,13 +152,15 @@ def main() -> None:
     from loopwright.service.server.loading import loading
 
     with loading():
+        for name in _LOADED:
+            import_module(name)
         from loopwright.service.server import serving
-        from tests.unit.service import gateway
 
         serving.load()
     gc.collect()
-    sys.argv[1:] = arguments_of_a_fork(socket.socket(fileno=int(sys.argv[1])))
-    gateway.main()
+    asked = socket.socket(fileno=int(sys.argv[1]))
+    sys.argv = arguments_of_a_fork(asked)
+    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 
 
 if __name__ == "__main__":
