@@ -197,11 +197,11 @@ class Plantsite:
         deadline = time.monotonic() + 30
         self.mode = Mode.AUTOMATIC
         near = 0
-        while near < 5:
+        while near < 3:
             state = self.state()
             assert time.monotonic() < deadline, state
             near = near + 1 if abs(state.pv - self.case.sp) < 2e-4 else 0
-            time.sleep(0.05)
+            time.sleep(0.1)
         self.write("plant_pace", pace)
         assert self.is_home()
 
@@ -257,18 +257,21 @@ class Plantsite:
         job: dict[str, Any] = answer.json()
         return job
 
-    def until(self, url: str, wanted: Callable[[dict[str, Any]], bool], patience_s: float = 200.0) -> dict[str, Any]:
+    def until(
+        self, url: str, wanted: Callable[[dict[str, Any]], bool], patience_s: float = 200.0, every_s: float = 0.05
+    ) -> dict[str, Any]:
+        """Each look takes some ms of processor time, in user-mode Linux many times that."""
         deadline = time.monotonic() + patience_s
         while time.monotonic() < deadline:
             job = self.job(url)
             if wanted(job):
                 return job
             assert job["state"] in ("queued", "running"), f"ended before: {job}"
-            time.sleep(0.05)
+            time.sleep(every_s)
         raise AssertionError(f"still {job}")
 
     def finished(self, url: str, patience_s: float = 200.0) -> dict[str, Any]:
-        return self.until(url, lambda job: job["state"] not in ("queued", "running"), patience_s)
+        return self.until(url, lambda job: job["state"] not in ("queued", "running"), patience_s, every_s=0.25)
 
     def until_watched(
         self, url: str, wanted: Callable[[dict[str, Any]], bool], patience_s: float = 200.0

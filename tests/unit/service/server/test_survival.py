@@ -79,7 +79,7 @@ class Gateway:
             if answer.status_code == 200 and wanted(answer.json()):
                 return dict(answer.json())
             assert time.monotonic() < deadline, answer.text
-            time.sleep(0.05)  # each look takes the service some ms of processor time
+            time.sleep(0.1)  # each look takes the service some ms of processor time
 
     def in_stage(self, url: str, stage: str) -> dict[str, Any]:
         """Runs the job up to the middle of a stage: the loop is on trial, and the API says which stage it is."""
