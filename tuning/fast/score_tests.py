@@ -62,6 +62,16 @@ def fading(record: ExperimentRecord) -> Reals:
     return np.asarray(record.u * grown / max(float(grown[-1]), 1.0))
 
 
+def since(piece: int) -> Callable[[ExperimentRecord], Reals]:
+    """MV of this piece of the record and of those after it, 0 before, MV units, shape (N,)."""
+
+    def of(record: ExperimentRecord) -> Reals:
+        begin = sum(record.pieces[:piece])
+        return np.concatenate((np.zeros(begin), record.u[begin:]))
+
+    return of
+
+
 def late(samples: int) -> Callable[[ExperimentRecord], Reals]:
     """MV so many samples later, 0 before each piece of the record, MV units, shape (N,)."""
 

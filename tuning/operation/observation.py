@@ -19,6 +19,7 @@ from loopwright.tuning.fast.design import DesignSpec, frequencies
 from loopwright.tuning.fast.evaluation import Evaluation, evaluate
 from loopwright.tuning.fast.record import MIN_LISTENED, Excitation, ExperimentRecord, noise_of
 from loopwright.tuning.fast.record_evaluation import first_period, own_period
+from loopwright.tuning.fast.score_tests import STANDARD_DEVIATIONS, ScoreTests, since
 from loopwright.tuning.fast.uncertainty import peak
 from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.models import Reals, TransferFunction
@@ -43,6 +44,9 @@ MIN_SIZE = 5.0
 MIN_CHANGES, MAX_CHANGES = 2, 12
 """Smallest number of set-point changes that can check each other, and the largest number that are looked at together:
 the latest ones."""
+MIN_GAIN_CHANGE = 0.1
+"""Smallest part by which the plant's gain must differ from one set-point change on for the earlier ones to be of an
+older plant."""
 MAX_LEFT_OUT, MAX_BY_SETPOINT = 0.06, 0.08
 """Largest difference of Ms with a change left out, and by the set-point alone."""
 REFITS = 2
@@ -133,16 +137,31 @@ def _at(period: float, stretches: Sequence[Stretch], reverse: bool, spec: Design
         for i in consistent(lambda which: _record(rest, [latest[i] for i in which], reverse, period), len(latest))
     ]
     evaluation = with_controller(evaluate(_record(rest, used, reverse, period), spec))
+    together = len(used)
+    while (older := _of_an_older_plant(evaluation, len(used))) > 0:
+        used = used[older:]
+        evaluation = with_controller(evaluate(_record(rest, used, reverse, period), spec))
     dropped = tuple(each for each in latest if each not in used)
     reason, detail = evaluation.reason, evaluation.detail
-    if reason is None and len(dropped) > len(used):
+    if reason is None and len(latest) - together > together:
         reason = Reason.DISTURBED
-        detail = f"one plant without disturbances explains only {len(used)} of {len(latest)} set-point changes"
+        detail = f"one plant without disturbances explains only {together} of {len(latest)} set-point changes"
     if reason is None and len(used) < MIN_CHANGES:
         reason, detail = Reason.UNCERTAIN, "one set-point change alone cannot be checked by another; wait for the next"
     if reason is None:
         reason, detail = _checked(evaluation, used, spec)
     return Observation(reason, detail, evaluation, tuple(used), dropped)
+
+
+def _of_an_older_plant(evaluation: Evaluation, changes: int) -> int:
+    """How many of the set-point changes, the oldest ones, are of a plant of another gain; 0 where none are."""
+    tests = ScoreTests(evaluation.fit, evaluation.chosen.best)
+    shown = []
+    for older in range(1, changes):
+        size, deviation = tests.score(since(1 + older))  # the first piece is the rest
+        if abs(size) > max(MIN_GAIN_CHANGE, STANDARD_DEVIATIONS * deviation):
+            shown.append((abs(size) / deviation, older))
+    return max(shown, default=(0.0, 0))[1]
 
 
 def _rest(stretches: Sequence[Stretch], length: int, after: int) -> tuple[Stretch, slice] | None:
