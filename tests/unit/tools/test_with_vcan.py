@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -111,7 +112,7 @@ def test_it_is_started_again_once_where_that_was_asked_for(
 ) -> None:
     commands: list[list[str]] = []
 
-    def guest(command: list[str], timeout: float, memory_mib: int, stall: float) -> int:
+    def guest(command: list[str], timeout: float, memory_mib: int, stall: float, first: bool) -> int:
         commands.append(command)
         return ends[len(commands) - 1]
 
@@ -122,3 +123,20 @@ def test_it_is_started_again_once_where_that_was_asked_for(
     assert tool.main() == status
     assert commands == [["true"]] * runs
     assert ("ONCE MORE, from the beginning" in capsys.readouterr().err) == (runs == 2)
+
+
+@pytest.mark.parametrize("permitted", [True, False])
+def test_the_guest_goes_first_where_the_user_may_do_that(
+    tool: ModuleType, monkeypatch: pytest.MonkeyPatch, permitted: bool
+) -> None:
+    asked: list[tuple[int, int, int]] = []
+
+    def scheduled(process: int, policy: int, parameter: os.sched_param) -> None:
+        asked.append((process, policy, parameter.sched_priority))
+        if not permitted:
+            raise PermissionError
+
+    monkeypatch.setattr(tool, "one_processor", lambda: None)
+    monkeypatch.setattr(os, "sched_setscheduler", scheduled)
+    tool.first_on_one_processor()
+    assert asked == [(0, os.SCHED_RR, 1)]
