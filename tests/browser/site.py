@@ -23,7 +23,6 @@ ABSENT = MappingProxyType(
 """An entry of loops.yaml that no controller answers for."""
 
 
-
 class Site(Plantsite):
     """A hub of its own, and a service that comes back at the same port, as one does whose page is open.
 

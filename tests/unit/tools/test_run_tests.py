@@ -86,7 +86,12 @@ def test_what_the_tests_write_is_in_memory_where_there_is_room(
     for name in ("vcan", "hub", "computing"):
         (tmp_path / name).mkdir()
         wanted = is_there and name != "vcan"
-        source = f"def test_of_{name}(tmp_path): assert ({str(memory)!r} in str(tmp_path)) == {wanted}\n"
+        source = (
+            "import os, tempfile\n"
+            f"def test_of_{name}(tmp_path):\n"
+            f"    assert ({str(memory)!r} in str(tmp_path)) == {wanted}\n"
+            "    assert os.stat(tempfile.gettempdir()).st_mode & 0o001  # for the database server's own user\n"
+        )
         (tmp_path / name / f"test_{name}.py").write_text(source)
         lanes.append(tool.Lane(name, (name,), in_guest=name == "vcan"))
     assert tool.main(sys.executable, tuple(lanes), ("true",)) == 0
