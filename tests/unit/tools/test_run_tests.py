@@ -71,33 +71,6 @@ def test_the_status_is_that_of_what_fails_alone_too(
     assert "== lane vcan" in told and "== lane hub" in told
 
 
-@pytest.mark.parametrize(("room_GiB", "is_there"), [(0, True), (10**9, False)])
-def test_what_the_tests_write_is_in_memory_where_there_is_room(
-    tool: ModuleType, room_GiB: int, is_there: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    memory = tmp_path / "memory"
-    memory.mkdir()
-    monkeypatch.setattr(tool, "IN_MEMORY", memory)
-    monkeypatch.setattr(tool, "ROOM_GIB", room_GiB)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
-    (tmp_path / "pytest.ini").write_text("[pytest]\n")
-    lanes = []
-    for name in ("vcan", "hub", "computing"):
-        (tmp_path / name).mkdir()
-        wanted = is_there and name != "vcan"
-        source = (
-            "import os, tempfile\n"
-            f"def test_of_{name}(tmp_path):\n"
-            f"    assert ({str(memory)!r} in str(tmp_path)) == {wanted}\n"
-            "    assert os.stat(tempfile.gettempdir()).st_mode & 0o001  # for the database server's own user\n"
-        )
-        (tmp_path / name / f"test_{name}.py").write_text(source)
-        lanes.append(tool.Lane(name, (name,), in_guest=name == "vcan"))
-    assert tool.main(sys.executable, tuple(lanes), ("true",)) == 0
-    assert not list(memory.iterdir())
-
-
 def test_no_folder_of_tests_is_left_out(tool: ModuleType) -> None:
     vcan, hub, computing = tool.LANES
     of_hub = {each for each in hub.tests if each.startswith("tests/")}
