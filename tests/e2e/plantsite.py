@@ -197,7 +197,7 @@ class Plantsite:
         deadline = time.monotonic() + 30
         self.mode = Mode.AUTOMATIC
         near = 0
-        while near < 3:
+        while near < 5:
             state = self.state()
             assert time.monotonic() < deadline, state
             near = near + 1 if abs(state.pv - self.case.sp) < 2e-4 else 0
