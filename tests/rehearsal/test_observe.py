@@ -97,6 +97,19 @@ def test_changes_of_an_older_plant_are_left_out() -> None:
     assert true_Ms(changed, found) == pytest.approx(1.6, abs=0.05)
 
 
+def test_changes_of_an_older_plant_that_fit_the_others_one_by_one_are_left_out() -> None:
+    """Under sluggish gains a plant whose gain is a quarter larger leaves no large residual in any one change."""
+    sluggish = Gains(0.25, 15.0)
+    before = operated(LAG, sluggish, changes([0.4, -0.3], 200.0))
+    changed = replace(LAG, K=1.25 * LAG.K)
+    after = replace(operated(changed, sluggish, changes([0.8, -0.3, 0.6, 0.0], 200.0)), t_s=5000.0)
+    found = observe([before, after], True, ASKED)
+    assert found.reason is None, found.detail
+    assert all(each.t_s > 5000.0 for each in found.used)
+    assert (len(found.used), len(found.dropped)) == (4, 2)
+    assert true_Ms(changed, found) == pytest.approx(1.6, abs=0.05)
+
+
 @pytest.mark.parametrize(
     ("sp", "noise", "said"),
     [
