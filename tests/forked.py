@@ -21,6 +21,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from importlib import import_module
 
@@ -105,6 +106,12 @@ def _parent() -> socket.socket:
     return ours
 
 
+def _say(end: socket.socket, number: int) -> None:
+    """The test may have let go of its process, as one does that has killed it by its pid."""
+    with suppress(ConnectionError):
+        end.send(str(number).encode())
+
+
 def arguments_of_a_fork(asked: socket.socket) -> list[str]:
     """Forks as often as it is asked to, and returns in each child. In the parent it ends with the connection."""
     woken, wakes = socket.socketpair()
@@ -119,7 +126,7 @@ def arguments_of_a_fork(asked: socket.socket) -> list[str]:
             woken.recv(_MESSAGE)
             while statuses and (ended := os.waitpid(-1, os.WNOHANG))[0]:
                 with statuses.pop(ended[0]) as end:
-                    end.send(str(os.waitstatus_to_exitcode(ended[1])).encode())
+                    _say(end, os.waitstatus_to_exitcode(ended[1]))
         if asked not in ready:
             continue
         message, fds, _, _ = socket.recv_fds(asked, _MESSAGE, 3)
@@ -145,7 +152,7 @@ def arguments_of_a_fork(asked: socket.socket) -> list[str]:
         for fd in (output, errors):
             os.close(fd)
         statuses[pid] = end
-        end.send(str(pid).encode())
+        _say(end, pid)
 
 
 def main() -> None:

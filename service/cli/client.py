@@ -18,11 +18,13 @@ DEFAULT_URL = "http://127.0.0.1:8080"
 KEY_VARIABLE = "LOOPWRIGHT_KEY"
 """The key is in the environment, because every user of the machine can read a command line."""
 _PATIENCE_S = 30.0
-"""Longest wait for the answer to a request whose connection broke, wall time, s."""
+"""Longest wait for an answer, also to a request that is repeated because its connection broke, wall time, s."""
 _SILENT_S = 15.0
 """Wall time after which a live stream that says nothing counts as cut off, s; it speaks about once a second."""
 _AGAIN_S = 2.0
 """Wall time between two attempts to reach the live stream, s."""
+
+_PERHAPS_CARRIED_OUT = "What was asked may have been carried out: look at the loop and its jobs before you repeat it."
 
 
 class ApiError(Exception):
@@ -40,7 +42,7 @@ class Client:
         self.url = url.rstrip("/")
         key = os.environ.get(KEY_VARIABLE)
         headers = {"Authorization": f"Bearer {key}"} if key else {}
-        self._http = httpx.Client(base_url=self.url, timeout=30.0, trust_env=False, headers=headers)
+        self._http = httpx.Client(base_url=self.url, timeout=_PATIENCE_S, trust_env=False, headers=headers)
 
     def get(self, path: str, **query: str | float | None) -> object:
         """Returns the JSON of the answer; a query of None is left out."""
@@ -83,7 +85,7 @@ class Client:
         try:
             answer = self._http.post(path, json=sent, headers=headers)
         except httpx.ConnectError as error:
-            raise self._no_service(error) from error
+            raise self._no_answer(error, f"POST {path}") from error
         except httpx.TransportError:
             answer = self._repeated(path, sent, headers)
         self._check(answer)
@@ -161,10 +163,19 @@ class Client:
         try:
             return self._http.request(method, path, params=query, json=body, headers=headers)
         except httpx.TransportError as error:
-            raise self._no_service(error) from error
+            carried_out = "" if method == "GET" else "\n" + _PERHAPS_CARRIED_OUT
+            raise self._no_answer(error, f"{method} {path}", carried_out) from error
 
-    def _no_service(self, error: Exception) -> ApiError:
-        return ApiError(f"no service at {self.url} ({error}); start one with: loopwright serve")
+    def _no_answer(self, error: httpx.TransportError, asked: str, carried_out: str = "") -> ApiError:
+        import httpx
+
+        if isinstance(error, httpx.ConnectError):
+            why = f"no service at {self.url} ({error}); start one with: loopwright serve"
+        elif isinstance(error, httpx.TimeoutException):
+            why = f"the service at {self.url} has not answered {asked} within {_PATIENCE_S:g} s; its log says why"
+        else:
+            why = f"the service at {self.url} broke the connection at {asked} ({error}); its log says why"
+        return ApiError(why + carried_out)
 
     @staticmethod
     def _check(answer: httpx.Response) -> None:

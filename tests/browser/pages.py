@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -65,12 +66,16 @@ class Pages:
     @contextmanager
     def expecting(self, *patterns: str) -> Iterator[None]:
         """While this lasts, and after it, the console may say what is found by one of the patterns: the browser itself
-        writes there whenever an answer is an error or the service is away. It has to say something of each."""
+        writes there whenever an answer is an error or the service is away. It has to say something of each, which may
+        be later than what made it do so."""
         before = len(self.heard)
         self.expected += patterns
         yield
+        give_up = time.monotonic() + PATIENCE_MS / 1000.0
         for pattern in patterns:
-            assert any(re.search(pattern, text) for text in self.heard[before:]), (pattern, self.heard[before:])
+            while not any(re.search(pattern, text) for text in self.heard[before:]):
+                assert time.monotonic() < give_up, (pattern, self.heard[before:])
+                self.browser.contexts[-1].pages[-1].wait_for_timeout(20.0)
 
     def unexpected(self) -> list[str]:
         """What a page did that no page may do."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 from playwright.sync_api import Page, Route, expect
 
@@ -52,11 +54,12 @@ def test_no_other_test_than_the_one_that_has_ended_is_shown(site: Site, pages: P
 
 
 def without_record(site: Site) -> None:
-    """A test of one sample: the abort comes while that is waited for."""
+    """A test of one sample: the abort comes while the next one is waited for, which takes a second."""
     site.write("plant_pace", 0.05)
     for _ in range(20):
         url = site.retune()
         site.until(url, lambda job: job["stage"] == "preflight")
+        time.sleep(0.5)  # a sample comes each second: every other time the first one is there, and never the second
         site.http.post(f"{url}/abort")
         job = site.finished(url)
         if len(site.ask(f"{url}/samples")["t_s"]) == 1:

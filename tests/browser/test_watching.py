@@ -7,6 +7,7 @@ import time
 import pytest
 from playwright.sync_api import Error, Page
 
+from tests.browser import pages as pages_module
 from tests.browser.pages import Pages
 
 MARKUP = "document.body.innerHTML = '<b>of a loop</b>'"
@@ -42,9 +43,10 @@ def test_a_request_to_another_origin_is_found(pages: Pages, page: Page) -> None:
     pages.forget()
 
 
-def test_what_is_expected_has_to_come(pages: Pages, page: Page) -> None:
+def test_what_is_expected_has_to_come(pages: Pages, page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
     with pages.expecting("seldom"):
         page.evaluate("console.error('it happens seldom')")
     assert pages.unexpected() == []
+    monkeypatch.setattr(pages_module, "PATIENCE_MS", 100.0)
     with pytest.raises(AssertionError), pages.expecting("never"):
         pass

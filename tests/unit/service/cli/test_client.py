@@ -57,9 +57,12 @@ def test_a_broken_connection_is_repeated_once_with_the_same_key(
     first, second = keys(sent)
     assert first == second and len(first) == 32 and sent[0].content == sent[1].content
     client, sent = through(monkeypatch, broken, broken)
-    with pytest.raises(ApiError, match="no service at"):
+    with pytest.raises(ApiError, match=r"POST /loops/TIC-101/retune .*\n.*may have been carried out"):
         client.post("/loops/TIC-101/retune")
     assert len(sent) == 2
+    client, _ = through(monkeypatch, broken, httpx.ConnectError("refused"))
+    with pytest.raises(ApiError, match=r"no service at .*\n.*may have been carried out"):
+        client.post("/loops/TIC-101/retune")
 
 
 def test_every_post_has_a_key_of_its_own_and_a_get_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,6 +79,20 @@ def test_a_service_that_is_not_there_is_said_at_once(monkeypatch: pytest.MonkeyP
     with pytest.raises(ApiError, match="start one with: loopwright serve"):
         client.post("/a")
     assert len(sent) == 1
+
+
+@pytest.mark.parametrize(
+    ("broken", "why"),
+    [(httpx.ReadTimeout("timed out"), "has not answered GET /loops within 30 s"),
+     (httpx.ReadError("reset"), r"broke the connection at GET /loops \(reset\)")],
+)  # fmt: skip
+def test_a_service_that_is_there_is_not_said_to_be_missing(
+    monkeypatch: pytest.MonkeyPatch, broken: Exception, why: str
+) -> None:
+    client, _ = through(monkeypatch, broken)
+    with pytest.raises(ApiError, match=why) as raised:
+        client.get("/loops")
+    assert "no service" not in str(raised.value) and "carried out" not in str(raised.value)
 
 
 def test_what_is_still_being_answered_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:

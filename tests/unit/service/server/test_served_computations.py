@@ -76,8 +76,15 @@ class Served:
         return self._log.read_text()
 
     def asked(self, body: dict[str, Any]) -> Future[httpx.Response]:
-        """The answer to a tuning."""
-        return self.threads.submit(httpx.post, f"{self.url}/tunings", json=body, timeout=200.0, trust_env=False)
+        """The answer to a tuning, which has a place as soon as the service has seen that the one before is gone."""
+
+        def answer() -> httpx.Response:
+            while True:
+                got = httpx.post(f"{self.url}/tunings", json=body, timeout=200.0, trust_env=False)
+                if got.status_code != 429:
+                    return got
+
+        return self.threads.submit(answer)
 
     def asked_and_left(self, body: dict[str, Any]) -> socket.socket:
         """The connection of a client that has asked and does not read the answer."""
