@@ -117,6 +117,9 @@ def arguments_of_a_fork(asked: socket.socket) -> list[str]:
     woken, wakes = socket.socketpair()
     for each in (woken, wakes):
         each.setblocking(False)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in handlers:  # a test that signals to all its children does not mean this one
+        signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.set_wakeup_fd(wakes.fileno())
     statuses: dict[int, socket.socket] = {}
@@ -138,6 +141,8 @@ def arguments_of_a_fork(asked: socket.socket) -> list[str]:
         if (pid := os.fork()) == 0:
             signal.set_wakeup_fd(-1)
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
             os.dup2(output, 1)
             os.dup2(errors, 2)
             for opened in (asked, woken, wakes, end, *statuses.values()):
