@@ -2,9 +2,9 @@
 
     python -m tests.forked FD
 
-Each is a process of its own with its own log, and is killed like any other. What a start of the service itself does
-until it is ready is the subject of test_start.py and test_stop.py, which start it anew, as the demo and the transcripts
-do with all of the processes.
+Each is a process of its own with its own log, and is killed like any other; those left over end with the process that
+has started them. What a start of the service itself does until it is ready is the subject of test_start.py and
+test_stop.py, which start it anew, as the demo and the transcripts do with all of the processes.
 """
 
 from __future__ import annotations
@@ -134,6 +134,8 @@ def arguments_of_a_fork(asked: socket.socket) -> list[str]:
             continue
         message, fds, _, _ = socket.recv_fds(asked, _MESSAGE, 3)
         if not message:
+            for pid in statuses:  # those that a test which was cut off has left
+                os.kill(pid, signal.SIGKILL)
             sys.exit()
         output, errors, end_fd = fds
         end = socket.socket(fileno=end_fd)
