@@ -67,17 +67,21 @@ def _around(first: int, record: Record, changes: Sequence[int], start: Fitted) -
 
 def _undisturbed(fit: Fit[ExperimentRecord], found: Fitted) -> bool:
     """Whether what the fit leaves of every change is noise, and no load disturbance in any of them explains much of
-    it."""
-    noise = max(fit.record.noise / fit.record.output_range, NEGLIGIBLE_RESIDUAL / MAX_RESIDUAL)
+    it.
+
+    A load just before the rest makes the noise at rest look larger than it is; half of the changes know better.
+    """
+    left_of_each = [float(np.sqrt(np.mean(found.linear.residual[rows] ** 2))) for rows in fit.rows[1:]]
+    noise = min(fit.record.noise / fit.record.output_range, float(np.median(left_of_each)))
+    noise = max(noise, NEGLIGIBLE_RESIDUAL / MAX_RESIDUAL)
     variance = noise**2 * max(fit.record.durbin_watson_ratio_at_rest, durbin_watson_ratio(found.linear.residual))
     longest = max(piece.stop - piece.start for piece in fit.pieces)
     answer = answers_to_load(found.structure, found.theta[None], longest, fit.block)[0]
     spacing = max(1, round(LOAD_TIME_SPACING * fit.period / fit.block))
-    for rows in fit.rows[1:]:
-        left = found.linear.residual[rows]
-        if float(np.sqrt(np.mean(left**2))) > MAX_RESIDUAL * noise:
+    for rows, left in zip(fit.rows[1:], left_of_each, strict=True):
+        if left > MAX_RESIDUAL * noise:
             return False
-        if _explained_by_load(left, answer, spacing) > MAX_BY_LOAD * variance:
+        if _explained_by_load(found.linear.residual[rows], answer, spacing) > MAX_BY_LOAD * variance:
             return False
     return True
 

@@ -8,19 +8,21 @@ the latter: P. Van den Hof, R. Schrama, Automatica 29, 1993.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.experiments.control_record import ControlPiece, ControlRecord, rows_without_limit
 from loopwright.tuning.fast.controller_effect import with_controller
 from loopwright.tuning.fast.design import DesignSpec, frequencies
-from loopwright.tuning.fast.evaluation import Evaluation, evaluate
+from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation, evaluate
 from loopwright.tuning.fast.record import MIN_LISTENED, Excitation, ExperimentRecord, noise_of
-from loopwright.tuning.fast.record_evaluation import first_period, own_period
+from loopwright.tuning.fast.record_evaluation import PERIOD_IS_RIGHT, first_period
 from loopwright.tuning.fast.score_tests import STANDARD_DEVIATIONS, ScoreTests, since
-from loopwright.tuning.fast.uncertainty import peak
+from loopwright.tuning.fast.uncertainty import difference_of_rivals, peak
 from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.models import Reals, TransferFunction
 from loopwright.tuning.operation.consistency import consistent
@@ -32,7 +34,7 @@ from loopwright.tuning.operation.history import (
     setpoint_changes,
 )
 from loopwright.tuning.operation.setpoint_alone import Ms_by_setpoint_alone
-from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.reasons import Ended, Reason, Refused
 
 BEFORE, AFTER = 1.0, 5.0
 """Periods before and after its first move that a set-point change is looked at."""
@@ -47,9 +49,17 @@ the latest ones."""
 MIN_GAIN_CHANGE = 0.1
 """Smallest part by which the plant's gain must differ from one set-point change on for the earlier ones to be of an
 older plant."""
-MAX_LEFT_OUT, MAX_BY_SETPOINT = 0.06, 0.08
-"""Largest difference of Ms with a change left out, and by the set-point alone."""
-REFITS = 2
+MIN_RESIDUAL = 0.7
+"""Smallest residual of the model, in standard deviations of the noise at rest. A smaller one shows that the loop was
+not at rest there, and that the residual was compared with more than the noise."""
+OTHER_BIC = 20.0
+"""Difference of BIC within which Ms on another structure counts. Two parameters more cost more than RIVAL_BIC where
+they explain nothing: a structure too simple for the plant then has no rival, and Ms on the richer ones says so."""
+MAX_BY_SETPOINT = 0.08
+"""Largest difference of Ms by the set-point alone."""
+REFITS, MAX_PERIOD_CHANGE = 4, 3.0
+"""Number of times that the changes are looked at again with the ultimate period that the model has; the largest factor
+between two of them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,14 +102,30 @@ def _observed(known: list[Stretch], stretches: Sequence[Stretch], reverse: bool,
     for _ in range(1 + REFITS):
         again = _at(period, stretches, reverse, spec)
         if again.evaluation is None:
-            return found or again
+            return _without_scale(found, again.detail) if found else again
         found = again
-        own = own_period(again.evaluation)
-        if own is None:
-            break
-        period = own
+        own = _own_period(again.evaluation)
+        low, high = PERIOD_IS_RIGHT
+        if low <= own / period <= high:
+            return found
+        period = min(max(own, period / MAX_PERIOD_CHANGE), period * MAX_PERIOD_CHANGE)
     assert found is not None
-    return found
+    return _without_scale(found, "the ultimate period is another one with each length that the changes are looked at")
+
+
+def _without_scale(found: Observation, detail: str) -> Observation:
+    """The observation as one whose changes were not looked at for as long as its model asks for: of no gains."""
+    return found if found.reason is not None else replace(found, reason=Reason.UNCERTAIN, detail=detail)
+
+
+def _own_period(evaluation: Evaluation) -> float:
+    """The ultimate period of the model, in samples; a model that cannot oscillate has the period that it was designed
+    at."""
+    model = evaluation.model
+    try:
+        return ultimate_point(replace(model, L=model.L + evaluation.design_delay))[1] / evaluation.fit.record.Ts
+    except Ended:
+        return evaluation.period / evaluation.fit.record.Ts
 
 
 def _first_period(stretches: Sequence[Stretch]) -> float:
@@ -235,13 +261,21 @@ def _model_without(fit: Fit[ExperimentRecord], found: Fitted, piece: int) -> Tra
 
 def _checked(evaluation: Evaluation, changes: Sequence[SetpointChange], spec: DesignSpec) -> tuple[Reason | None, str]:
     """The reason and the sentence where a check of the whole speaks against the gains."""
+    if evaluation.residual < MIN_RESIDUAL:
+        text = f"the model leaves {evaluation.residual:.2g} of what moved PV where the loop seemed to rest"
+        return Reason.UNCERTAIN, f"{text}: something else moved PV there, and the noise is not known"
     fit, best, gains = evaluation.fit, evaluation.chosen.best, evaluation.best.gains
     w, delay = frequencies(evaluation.period), evaluation.design_delay
     left = [_model_without(fit, best, piece) for piece in range(1, len(fit.pieces))]
-    worst = max(abs(peak(model, gains, w, delay) - evaluation.Ms) for model in left)
-    if worst > MAX_LEFT_OUT:
-        text = f"without one of the {len(changes)} set-point changes Ms would differ by {worst:.2g}"
-        return Reason.UNCERTAIN, text
+    left_out = max(abs(peak(model, gains, w, delay) - evaluation.Ms) for model in left)
+    others = [each for each in evaluation.chosen.fits if each.bic < best.bic + OTHER_BIC]
+    on_others = max(evaluation.ambiguity, difference_of_rivals(fit, best, others, gains, w, delay))
+    # no step under these gains follows before they are proposed: what may be wrong adds up
+    known_to = math.hypot(evaluation.uncertainty, on_others, left_out)
+    if known_to > MAX_UNCERTAINTY[Excitation.OBSERVE]:
+        parts = f"{evaluation.uncertainty:.2g} by its standard error, {on_others:.2g} on another model"
+        text = f"{left_out:.2g} without one of the {len(changes)} set-point changes"
+        return Reason.UNCERTAIN, f"Ms is known to +-{known_to:.2g} only: {parts}, {text}"
     alone = Ms_by_setpoint_alone(evaluation, changes, spec.N)
     if abs(alone - evaluation.Ms) > MAX_BY_SETPOINT:
         return Reason.DISTURBED, f"what the set-point alone moved gives Ms {alone:.2f} instead of {evaluation.Ms:.2f}"
