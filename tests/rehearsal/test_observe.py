@@ -112,6 +112,14 @@ def test_changes_of_an_older_plant_that_fit_the_others_one_by_one_are_left_out()
     assert true_Ms(changed, found) == pytest.approx(1.6, abs=0.05)
 
 
+def test_a_plant_of_which_only_the_latest_change_tells_that_it_is_another_one_gets_no_gains() -> None:
+    before = operated(LAG, PI, changes([0.8, -0.3, 0.6], 200.0))
+    after = replace(operated(replace(LAG, K=1.6 * LAG.K), PI, changes([0.8], 200.0)), t_s=5000.0)
+    found = observe([before, after], True, ASKED)
+    assert found.reason is Reason.DISTURBED and "the latest set-point change does not fit" in found.detail
+    assert [each.t_s > 5000.0 for each in found.dropped] == [True]
+
+
 @pytest.mark.parametrize(("number", "present", "kind"), [(74, "sluggish", "quiet"), (36, "nearly unstable", "loads")])
 def test_the_gains_are_right_or_none(number: int, present: str, kind: str) -> None:
     """Plants drawn at random. Ms was wrong by 0.11 for the first one, on a structure too simple to have a rival, and by

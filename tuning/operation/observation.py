@@ -172,6 +172,9 @@ def _at(period: float, stretches: Sequence[Stretch], reverse: bool, spec: Design
     if reason is None and len(latest) - together > together:
         reason = Reason.DISTURBED
         detail = f"one plant without disturbances explains only {together} of {len(latest)} set-point changes"
+    if reason is None and latest[-1] not in used:
+        text = "the latest set-point change does not fit the earlier ones"
+        reason, detail = Reason.DISTURBED, f"{text}: it was disturbed, or the plant has changed; wait for the next"
     if reason is None and len(used) < MIN_CHANGES:
         reason, detail = Reason.UNCERTAIN, "one set-point change alone cannot be checked by another; wait for the next"
     if reason is None:
