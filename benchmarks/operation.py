@@ -1,13 +1,14 @@
 """How many set-point changes of normal operation give gains, and how right these are: judged on the true plant.
 
-    python -m benchmarks.operation [--plants batch|kept-apart] [--every N] [--seeds N] [--kinds "quiet;loads"] ...
+    python -m benchmarks.operation [--plants batch|kept-apart | --random 1000-1099] [--seeds N]
+        [--kinds "quiet;loads"] ...
 
 The plants of "batch" are every second of the Astrom-Hagglund batch; on them the rules were set. Those kept apart are
-the 50 models of the five-stage paper and the linearised reactor. An operator moves the set-point by 0.3 to 1 of the
-permitted step, up or down, every 14 ultimate periods; noise is white, of 1 % of the permitted step. The gains in effect
-are sluggish (Ms 1.1 to 1.2), typical (1.3 to 2) or nearly unstable (2.8 to 3.2), with Ti of half to 2.5 times that of
-the best PI. After 1, 2, 3, 4, 6, 8 and 12 changes the operation is evaluated; the first proposal counts. Ms 1.6 is
-asked for.
+the 50 models of the five-stage paper and the linearised reactor. Plants drawn at random judge from number 1000 on.
+An operator moves the set-point by 0.3 to 1 of the permitted step, up or down, every 14 ultimate periods; noise is
+white, of 1 % of the permitted step. The gains in effect are sluggish (Ms 1.1 to 1.2), typical (1.3 to 2) or nearly
+unstable (2.8 to 3.2), with Ti of half to 2.5 times that of the best PI. After 1, 2, 3, 4, 6, 8 and 12 changes the
+operation is evaluated; the first proposal counts. Ms 1.6 is asked for.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from benchmarks.cases import ASKED, PI
 from benchmarks.command import check_names, parser_of
 from benchmarks.drawn_runs import Draw, DrawNames, run_all
 from benchmarks.plants import Plant, plants
-from benchmarks.tuning import cost_over_best, optimum, spread
+from benchmarks.random_plants import random_plants
+from benchmarks.tuning import cost_over_best, numbers_of, optimum, spread
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
@@ -218,6 +220,9 @@ def table(ran: list[Operated]) -> Iterator[str]:
 def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--plants", choices=("batch", "kept-apart"), default="kept-apart")
+    parser.add_argument(
+        "--random", type=numbers_of, metavar="FIRST-LAST", help="plants drawn at random: `benchmarks.random_plants`"
+    )
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--kinds", default=";".join(KINDS))
@@ -227,10 +232,11 @@ def main() -> None:
     given = parser.parse_args()
     check_names(parser, "kind", given.kinds.split(";"), KINDS)
     check_names(parser, "present", given.present.split(";"), PRESENT)
+    which = random_plants(given.random) if given.random else chosen(given.plants, given.every)
     todo = [
         (plant, present, kind, seed)
+        for seed in range(1, given.seeds + 1) for plant in which
         for kind in given.kinds.split(";") for present in given.present.split(";")
-        for plant in chosen(given.plants, given.every) for seed in range(1, given.seeds + 1)
     ]  # fmt: skip
     ran = list(run_all(Operated, _operated, todo, given.save, given.processes))
     print(*table(ran), sep="\n")

@@ -282,9 +282,9 @@ def runs_parser(doc: str | None) -> argparse.ArgumentParser:
         "--part", type=_part, default="0/1", metavar="I/N", help="every N-th of these plants, from the I-th on"
     )
     parser.add_argument(
-        "--random", type=_seeds, metavar="FIRST-LAST", help="plants drawn at random: `benchmarks.random_plants`"
+        "--random", type=numbers_of, metavar="FIRST-LAST", help="plants drawn at random: `benchmarks.random_plants`"
     )
-    parser.add_argument("--seeds", type=_seeds, default="1", metavar="N", help="so many, or FIRST-LAST")
+    parser.add_argument("--seeds", type=numbers_of, default="1", metavar="N", help="so many, or FIRST-LAST")
     parser.add_argument("--save", type=Path, help="a line of JSON for every run; what it holds is not run again")
     parser.add_argument("--of", type=Path, help="the table of such a file, nothing is run")
     return parser
@@ -297,7 +297,7 @@ def _part(text: str) -> tuple[int, int]:
     return part, parts
 
 
-def _seeds(text: str) -> range:
+def numbers_of(text: str) -> range:
     first, _, last = text.rpartition("-")
     return range(int(first or 1), int(last) + 1)
 
