@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
@@ -57,7 +57,9 @@ class Kind:
     wandering: the standard deviation of a load disturbance that wanders, in MV units that move PV by a permitted step.
     loads: whether the load steps, by 0.1 to 0.5 of these units, once for each change on average.
     most_loads: the largest number of steps of the load, None for as many as changes.
+    drift: whether the load drifts at a constant rate, by 0.1 to 0.5 of these units from one change to the next.
     gain: by how much the plant's gain has changed after the second change.
+    later: by how many ultimate periods the dead time has become longer then.
     sizes: the least and the largest change of the set-point, in permitted steps.
     stiction: the valve stays until MV is off by this, in the same units.
     """
@@ -66,7 +68,9 @@ class Kind:
     wandering: float = 0.0
     loads: bool = False
     most_loads: int | None = None
+    drift: bool = False
     gain: float = 1.0
+    later: float = 0.0
     sizes: tuple[float, float] = (0.3, 1.0)
     stiction: float = 0.0
 
@@ -79,6 +83,9 @@ KINDS = {
     "gain x 1.5 after two changes": Kind(gain=1.5),
     "changes of 5 to 20 noises": Kind(sizes=(0.05, 0.2)),
     "valve that sticks": Kind(stiction=0.02),
+    "drift": Kind(drift=True),
+    "gain x 0.7 after two changes": Kind(gain=0.7),
+    "dead time 0.1 Pu longer after two changes": Kind(later=0.1),
 }
 
 
@@ -138,6 +145,9 @@ def operation(plant: Plant, gains: Gains, kind: Kind, random: np.random.Generato
     loads = dict.fromkeys(random.integers(every * changes, size=count).tolist(), 0.0)
     for at in loads:
         loads[at] = unit * random.choice((-1.0, 1.0)) * random.uniform(0.1, 0.5)
+    drift = unit * random.choice((-1.0, 1.0)) * random.uniform(0.1, 0.5) / every if kind.drift else 0.0
+    later = round(kind.later * SAMPLES)
+    at_plant: deque[float] = deque([0.0] * (later + 1), later + 1)
     rows = []
     pv, sp, load, wandering, valve = process.pv, 0.0, 0.0, 0.0, 0.0
     decay = math.exp(-1.0 / SAMPLES)
@@ -148,13 +158,14 @@ def operation(plant: Plant, gains: Gains, kind: Kind, random: np.random.Generato
             channel.setpoint = sp
         mv = channel.step(pv)
         rows.append((mv, pv, sp))
-        load += loads.get(k, 0.0)
+        load += loads.get(k, 0.0) + drift
         wandering *= decay
         wandering += math.sqrt(1.0 - decay**2) * kind.wandering * unit * random.standard_normal()
         if abs(mv - valve) >= kind.stiction * unit:
             valve = mv
-        gain = kind.gain if len(moves) > 2 and k > moves[1] + every // 2 else 1.0
-        pv = process.step(gain * (valve + load + wandering))
+        at_plant.append(valve + load + wandering)
+        changed = len(moves) > 2 and k > moves[1] + every // 2
+        pv = process.step(kind.gain * at_plant[0] if changed else at_plant[-1])
     columns = np.array(rows).T
     return Stretch(0.0, plant.Ts, columns[0], columns[1], columns[2], gains)
 
@@ -177,13 +188,18 @@ def operated(plant: Plant, present: str, kind: str, seed: int) -> Operated:
         reason, detail = found.reason, found.detail
         if found.reason is None and found.evaluation is not None:
             proposed = found.evaluation.best.gains
-            factor = KINDS[kind].gain if looks > 2 else 1.0
-            now = replace(plant, num=tuple(factor * each for each in plant.num))
+            now = plant if looks <= 2 else _changed(plant, KINDS[kind])
             true = margins(now.model(), proposed)
             Ms = true.Ms if true.stable else None
             ratio = cost_over_best(now, proposed) if true.stable else None
             return Operated(plant.name, present, kind, seed, looks, None, "", Ms, ratio, spent)
     return Operated(plant.name, present, kind, seed, None, reason.value if reason else None, detail, None, None, spent)
+
+
+def _changed(plant: Plant, kind: Kind) -> Plant:
+    """The plant as it is after the second change."""
+    later = round(kind.later * SAMPLES) * plant.Ts
+    return replace(plant, num=tuple(kind.gain * each for each in plant.num), L=plant.L + later)
 
 
 def _operated(given: Draw) -> Operated:

@@ -67,7 +67,7 @@ class KnownMsView(Figures):
     Ms: float | None = Field(description="Maximum sensitivity on the model", examples=[1.9])
     uncertainty: float | None = Field(
         description="How far Ms may be off: by two standard deviations of the model, or on another model that explains "
-        "the record as well",
+        "the record as well; from normal operation alone, where no step follows, by all that may be wrong together",
         examples=[0.03],
     )
 

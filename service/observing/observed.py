@@ -38,6 +38,7 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.operation.history import SetpointChange
 from loopwright.tuning.operation.known import known_plant
 from loopwright.tuning.operation.observation import Observation, observe
+from loopwright.tuning.operation.plausible_models import PlausibleModels
 from loopwright.tuning.reasons import Reason, Refused
 
 NEVER_TRIED = (
@@ -263,8 +264,8 @@ def operation_fields(found: Observation, compared: Comparison | None, present: G
         "mv_range": _range([each.stretch.mv[each.samples] for each in used]),
         "model": None if evaluation is None else identified_model(evaluation.fit, evaluation.chosen.best),
         "residual": None if evaluation is None else evaluation.residual,
-        "present": _known(trusted, present),
-        "proposed": None if designed is None else _known(designed, designed.best.gains),
+        "present": _known(trusted, found.models, present),
+        "proposed": None if designed is None else _known(designed, found.models, designed.best.gains),
         "ultimate": None if evaluation is None else ultimate(evaluation.model),
         "predicted": None if compared is None else predicted(compared.after),
         "predicted_before": predicted(compared.before) if compared is not None and compared.before.stable else None,
@@ -275,13 +276,17 @@ def operation_fields(found: Observation, compared: Comparison | None, present: G
 def _in_words(evaluation: Evaluation | None, found: Observation) -> str:
     if evaluation is None:
         return "Ms is not known"
-    known, count = max(evaluation.uncertainty, evaluation.ambiguity), len(found.used)
+    doubt = None if found.models is None else found.models.doubt(evaluation.best.gains)
+    known = max(evaluation.uncertainty, evaluation.ambiguity) if doubt is None else doubt.whole
+    count = len(found.used)
     at_best = "at best " if found.reason is not None else ""
     return f"Ms known to +-{known:.2g} {at_best}from {count} set-point change{'s' * (count != 1)}"
 
 
-def _known(evaluation: Evaluation | None, gains: Gains) -> dict[str, object]:
-    found = None if evaluation is None else known_Ms(evaluation, gains)
+def _known(evaluation: Evaluation | None, models: PlausibleModels | None, gains: Gains) -> dict[str, object]:
+    found = None
+    if evaluation is not None:
+        found = known_Ms(evaluation, gains) if models is None else models.known_Ms(gains)
     return {
         "gains": gains,
         "Ms": found.Ms if found else None,

@@ -6,7 +6,7 @@ be wrong. The set-point step moves MV by small amounts in both directions, and t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,12 +14,14 @@ import numpy as np
 from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN
 from loopwright.tuning.identification.output_error import DisturbanceHypothesis, Fit, Fitted
-from loopwright.tuning.models import Reals
+from loopwright.tuning.models import Reals, TransferFunction
 
 SIZES = (0.03, 0.06, 0.11, 0.19, 0.31)  # of MV's largest move
 MIN_STICTION = 0.04
 """Smallest stiction, as a fraction of the largest deviation of MV. A smaller one cannot be told from a plant that is
 none of the structures, and does not change Ms."""
+SMALL = (0.01, 0.02, 0.03)
+"""Sizes of a fault, as fractions of the largest deviation of MV, that a sound valve may have and that may change Ms."""
 SATURATIONS, MAX_SATURATION = (0.55, 0.7, 0.85), 0.96
 FIRST_STEPS, STEPS = 4, 10
 REFINED = (1.25, 1.1, 1.04)
@@ -78,14 +80,10 @@ def find_valve_fault(fit: Fit[ExperimentRecord], best: Fitted) -> ValveFault | N
     # The position of the valve within its backlash is unknown at rest; it acts as a load disturbance from the start of
     # the relay.
     slack = DisturbanceHypothesis(load_disturbances=1)
-    # every piece begins at rest
-    pieces = np.split(record.u / record.input_range, np.cumsum(record.pieces)[:-1])
     start = np.append(best.theta[: structure.searched], record.listened)
 
     def fitted_with(fault: Callable[[Reals, float], Reals], size: float, theta: Reals, steps: int) -> Fitted:
-        positions = [record.input_range * fault(u, size) for u in pieces]
-        moved = Fit(replace(record, u=np.concatenate(positions)))
-        return moved.search(structure, slack, [theta], steps)
+        return Fit(_with_fault(record, fault, size)).search(structure, slack, [theta], steps)
 
     tried = [
         (fitted_with(fault, size, start, FIRST_STEPS), fault, size)
@@ -105,6 +103,28 @@ def find_valve_fault(fit: Fit[ExperimentRecord], best: Fitted) -> ValveFault | N
     sound = fit.search(structure, slack, [start, found.theta], FIRST_STEPS + STEPS)
     gain = min(best.bic, sound.bic) - found.bic
     return ValveFault(FAULTS[fault][1].format(size * record.input_range), gain) if gain > MIN_BIC_GAIN else None
+
+
+def models_of_small_faults(fit: Fit[ExperimentRecord], best: Fitted, max_bic: float) -> Iterator[TransferFunction]:
+    """The models of the plant where the valve moves a little less than MV, and BIC is below max_bic.
+
+    A valve that follows or sticks by a few hundredths of MV's largest deviation leaves hardly a trace in a record that
+    moves MV little, and makes the plant seem weaker than it is.
+    """
+    for fault in (backlash, stiction):
+        theta = best.theta
+        for size in SMALL:
+            moved = Fit(_with_fault(fit.record, fault, size))
+            found = moved.search(best.structure, best.hypothesis, [theta], STEPS)
+            theta = found.theta
+            if found.bic < max_bic:
+                yield moved.model(found)
+
+
+def _with_fault(record: ExperimentRecord, fault: Callable[[Reals, float], Reals], size: float) -> ExperimentRecord:
+    """The record with the position of such a valve for MV; every piece begins at rest."""
+    pieces = np.split(record.u / record.input_range, np.cumsum(record.pieces)[:-1])
+    return replace(record, u=record.input_range * np.concatenate([fault(u, size) for u in pieces]))
 
 
 def _bic(each: tuple[Fitted, object, float]) -> float:

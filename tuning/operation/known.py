@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
@@ -18,7 +20,8 @@ def known_plant(found: Observation, sample_time_s: float, age_s: float) -> Obser
         return NothingKnown(found.detail)
     evaluation, used = found.evaluation, found.used
     record = evaluation.fit.record
-    uncertainty = max(evaluation.uncertainty, evaluation.ambiguity)
+    doubt = None if found.models is None else found.models.doubt(evaluation.best.gains)
+    uncertainty = math.inf if doubt is None else doubt.whole
     return ObservedPlant(
         record=record,
         together=max(1, round(record.Ts / sample_time_s)),

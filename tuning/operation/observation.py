@@ -8,7 +8,6 @@ the latter: P. Van den Hof, R. Schrama, Automatica 29, 1993.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -17,14 +16,12 @@ import numpy as np
 from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.experiments.control_record import ControlPiece, ControlRecord, rows_without_limit
 from loopwright.tuning.fast.controller_effect import with_controller
-from loopwright.tuning.fast.design import DesignSpec, frequencies
+from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation, evaluate
 from loopwright.tuning.fast.record import MIN_LISTENED, Excitation, ExperimentRecord, noise_of
 from loopwright.tuning.fast.record_evaluation import PERIOD_IS_RIGHT, first_period
 from loopwright.tuning.fast.score_tests import STANDARD_DEVIATIONS, ScoreTests, since
-from loopwright.tuning.fast.uncertainty import difference_of_rivals, peak
-from loopwright.tuning.identification.output_error import Fit, Fitted
-from loopwright.tuning.models import Reals, TransferFunction
+from loopwright.tuning.models import Reals
 from loopwright.tuning.operation.consistency import consistent
 from loopwright.tuning.operation.history import (
     SetpointChange,
@@ -33,6 +30,7 @@ from loopwright.tuning.operation.history import (
     require_operator,
     setpoint_changes,
 )
+from loopwright.tuning.operation.plausible_models import Doubt, PlausibleModels, plausible_models
 from loopwright.tuning.operation.setpoint_alone import Ms_by_setpoint_alone
 from loopwright.tuning.reasons import Ended, Reason, Refused
 
@@ -52,9 +50,6 @@ older plant."""
 MIN_RESIDUAL = 0.7
 """Smallest residual of the model, in standard deviations of the noise at rest. A smaller one shows that the loop was
 not at rest there, and that the residual was compared with more than the noise."""
-OTHER_BIC = 20.0
-"""Difference of BIC within which Ms on another structure counts. Two parameters more cost more than RIVAL_BIC where
-they explain nothing: a structure too simple for the plant then has no rival, and Ms on the richer ones says so."""
 MAX_BY_SETPOINT = 0.08
 """Largest difference of Ms by the set-point alone."""
 REFITS, MAX_PERIOD_CHANGE = 4, 3.0
@@ -71,6 +66,7 @@ class Observation:
     evaluation: the evaluation of the record of all changes used, None without one.
     used: the changes that belong to one plant.
     dropped: further changes, which do not fit these.
+    models: what else the record leaves possible, None where that was not looked at.
     """
 
     reason: Reason | None
@@ -78,6 +74,7 @@ class Observation:
     evaluation: Evaluation | None = None
     used: tuple[SetpointChange, ...] = ()
     dropped: tuple[SetpointChange, ...] = ()
+    models: PlausibleModels | None = None
 
 
 def observe(stretches: Sequence[Stretch], reverse: bool, spec: DesignSpec) -> Observation:
@@ -177,9 +174,8 @@ def _at(period: float, stretches: Sequence[Stretch], reverse: bool, spec: Design
         reason, detail = Reason.DISTURBED, f"{text}: it was disturbed, or the plant has changed; wait for the next"
     if reason is None and len(used) < MIN_CHANGES:
         reason, detail = Reason.UNCERTAIN, "one set-point change alone cannot be checked by another; wait for the next"
-    if reason is None:
-        reason, detail = _checked(evaluation, used, spec)
-    return Observation(reason, detail, evaluation, tuple(used), dropped)
+    found = Observation(reason, detail, evaluation, tuple(used), dropped)
+    return found if found.reason is not None else _checked(found, spec)
 
 
 def _of_an_older_plant(evaluation: Evaluation, changes: int) -> int:
@@ -247,39 +243,34 @@ def _deviation(column: Reals, at: slice, before: slice) -> Reals:
     return np.asarray(column[at] - rest[len(rest) // 2])
 
 
-def _model_without(fit: Fit[ExperimentRecord], found: Fitted, piece: int) -> TransferFunction:
-    """The model of the same structure, fitted without one piece of the record."""
-    record, structure = fit.record, found.structure
-    end = int(np.sum(record.lengths[: piece + 1]))
-    left = np.delete(np.arange(len(record.u)), slice(end - record.lengths[piece], end))
-    lengths = record.lengths[:piece] + record.lengths[piece + 1 :]
-    fewer = Fit(replace(record, u=record.u[left], y=record.y[left], excited=len(left), lengths=lengths))
-    times, out = found.theta[structure.searched :], fit.pieces[piece]
-    times = times[(times < out.start) | (times >= out.stop)]
-    times = np.where(times >= out.stop, times - (out.stop - out.start), times)
-    hypothesis = replace(found.hypothesis, load_disturbances=len(times))
-    theta = np.append(found.theta[: structure.searched], times)
-    return fewer.model(fewer.search(structure, hypothesis, [theta]))
-
-
-def _checked(evaluation: Evaluation, changes: Sequence[SetpointChange], spec: DesignSpec) -> tuple[Reason | None, str]:
-    """The reason and the sentence where a check of the whole speaks against the gains."""
+def _checked(found: Observation, spec: DesignSpec) -> Observation:
+    """The observation, without gains where a check of the whole speaks against them."""
+    evaluation, changes = found.evaluation, found.used
+    assert evaluation is not None
     if evaluation.residual < MIN_RESIDUAL:
         text = f"the model leaves {evaluation.residual:.2g} of what moved PV where the loop seemed to rest"
-        return Reason.UNCERTAIN, f"{text}: something else moved PV there, and the noise is not known"
-    fit, best, gains = evaluation.fit, evaluation.chosen.best, evaluation.best.gains
-    w, delay = frequencies(evaluation.period), evaluation.design_delay
-    left = [_model_without(fit, best, piece) for piece in range(1, len(fit.pieces))]
-    left_out = max(abs(peak(model, gains, w, delay) - evaluation.Ms) for model in left)
-    others = [each for each in evaluation.chosen.fits if each.bic < best.bic + OTHER_BIC]
-    on_others = max(evaluation.ambiguity, difference_of_rivals(fit, best, others, gains, w, delay))
-    # no step under these gains follows before they are proposed: what may be wrong adds up
-    known_to = math.hypot(evaluation.uncertainty, on_others, left_out)
-    if known_to > MAX_UNCERTAINTY[Excitation.OBSERVE]:
-        parts = f"{evaluation.uncertainty:.2g} by its standard error, {on_others:.2g} on another model"
-        text = f"{left_out:.2g} without one of the {len(changes)} set-point changes"
-        return Reason.UNCERTAIN, f"Ms is known to +-{known_to:.2g} only: {parts}, {text}"
+        detail = f"{text}: something else moved PV there, and the noise is not known"
+        return replace(found, reason=Reason.UNCERTAIN, detail=detail)
+    gains, limit = evaluation.best.gains, MAX_UNCERTAINTY[Excitation.OBSERVE]
+    models = plausible_models(evaluation)
+    doubt = models.doubt(gains)
+    if doubt is not None and doubt.whole <= limit:
+        models = models.with_valve()
+        doubt = models.doubt(gains)
+    found = replace(found, models=models)
+    if doubt is None or doubt.whole > limit:
+        return replace(found, reason=Reason.UNCERTAIN, detail=_in_words(doubt, len(changes)))
     alone = Ms_by_setpoint_alone(evaluation, changes, spec.N)
     if abs(alone - evaluation.Ms) > MAX_BY_SETPOINT:
-        return Reason.DISTURBED, f"what the set-point alone moved gives Ms {alone:.2f} instead of {evaluation.Ms:.2f}"
-    return None, ""
+        detail = f"what the set-point alone moved gives Ms {alone:.2f} instead of {evaluation.Ms:.2f}"
+        return replace(found, reason=Reason.DISTURBED, detail=detail)
+    return found
+
+
+def _in_words(doubt: Doubt | None, changes: int) -> str:
+    if doubt is None:
+        return "Ms is not known: the loop is not stable on the model"
+    parts = f"{doubt.standard_error:.2g} by its standard error, {doubt.on_others:.2g} on another model"
+    parts += f", {doubt.on_valve:.2g} with a valve that moves a little less than MV" if doubt.on_valve else ""
+    text = f"{doubt.left_out:.2g} without one of the {changes} set-point changes"
+    return f"Ms is known to +-{doubt.whole:.2g} only: {parts}, {text}"
