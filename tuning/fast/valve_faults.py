@@ -105,11 +105,12 @@ def find_valve_fault(fit: Fit[ExperimentRecord], best: Fitted) -> ValveFault | N
     return ValveFault(FAULTS[fault][1].format(size * record.input_range), gain) if gain > MIN_BIC_GAIN else None
 
 
-def models_of_small_faults(fit: Fit[ExperimentRecord], best: Fitted, max_bic: float) -> Iterator[TransferFunction]:
-    """The models of the plant where the valve moves a little less than MV, and BIC is below max_bic.
+def models_of_small_faults(fit: Fit[ExperimentRecord], best: Fitted) -> Iterator[TransferFunction]:
+    """The models of the plant where the valve moves a little less than MV and the record does not exclude that.
 
     A valve that follows or sticks by a few hundredths of MV's largest deviation leaves hardly a trace in a record that
-    moves MV little, and makes the plant seem weaker than it is.
+    moves MV little, and makes the plant seem weaker than it is. It is excluded where it raises BIC by MIN_BIC_GAIN, as
+    much as it would have to lower BIC to be believed.
     """
     for fault in (backlash, stiction):
         theta = best.theta
@@ -117,7 +118,7 @@ def models_of_small_faults(fit: Fit[ExperimentRecord], best: Fitted, max_bic: fl
             moved = Fit(_with_fault(fit.record, fault, size))
             found = moved.search(best.structure, best.hypothesis, [theta], STEPS)
             theta = found.theta
-            if found.bic < max_bic:
+            if found.bic < best.bic + MIN_BIC_GAIN:
                 yield moved.model(found)
 
 

@@ -58,8 +58,8 @@ class PlausibleModels:
 
     def with_valve(self) -> PlausibleModels:
         """These with the models of a valve that moves a little less than MV."""
-        fit, best = self.evaluation.fit, self.evaluation.chosen.best
-        return replace(self, valve=tuple(models_of_small_faults(fit, best, best.bic + OTHER_BIC)))
+        found = models_of_small_faults(self.evaluation.fit, self.evaluation.chosen.best)
+        return replace(self, valve=tuple(found))
 
     def doubt(self, gains: Gains) -> Doubt | None:
         """How far Ms of these gains may be off; None where the loop is not stable on the model."""
