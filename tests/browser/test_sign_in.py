@@ -95,7 +95,8 @@ def test_a_key_that_may_read_has_no_button_that_changes_something(
     sent: list[str] = []
     page.on("request", lambda request: sent.append(request.method))
     page.keyboard.press("Control+.")
-    page.get_by_role("link", name="Retunes").click()
+    with page.expect_request("**/retunes*"):
+        page.get_by_role("link", name="Retunes").click()
     expect(main.get_by_role("heading", name="Retunes")).to_be_visible()
     expect(main.get_by_role("button")).to_have_count(0)
     assert set(sent) == {"GET"}

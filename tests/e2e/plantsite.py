@@ -299,8 +299,8 @@ class Plantsite:
             tuner.close()
 
     def write(self, name: str, value: float) -> None:
-        """By SDO, as somebody else on the bus would."""
-        tuner = Tuner(self.bus, 0x20, 0x10)
+        """By SDO, as somebody else on the bus would, who waits for a busy machine."""
+        tuner = Tuner(self.bus, 0x20, 0x10, sdo_tries=20)
         try:
             tuner.write(name, value)
         finally:

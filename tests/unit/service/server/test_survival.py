@@ -198,13 +198,13 @@ def test_a_locked_database_delays_nothing_but_the_answers(stack: ExitStack, tmp_
     gateway.in_stage(url, "relay")
     with closing(sqlite3.connect(tmp_path / "data" / "loopwright.sqlite", isolation_level=None)) as other:
         other.execute("BEGIN EXCLUSIVE")
-        began = time.monotonic()
         gateway.go()
+        until(lambda: read_loop(tmp_path, TAG) == HOME)  # the job runs to its end while nothing can be written
+        began = time.monotonic()
         answer = gateway.http.post(f"{url}/abort")
         assert (answer.status_code, answer.headers["retry-after"]) == (503, "5")
         # At most one wait for another writer of the process, and one for the file; the rest is for a busy machine.
         assert WAIT_S <= time.monotonic() - began < 2 * WAIT_S + 30
-        until(lambda: read_loop(tmp_path, TAG) == HOME)  # the job runs to its end while nothing can be written
         other.execute("ROLLBACK")
     job = gateway.over(url)
     assert (job["state"], job["attempts"]) == ("proposed", 1)
