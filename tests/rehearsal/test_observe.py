@@ -122,12 +122,18 @@ def test_a_plant_of_which_only_the_latest_change_tells_that_it_is_another_one_ge
 
 @pytest.mark.parametrize(
     ("number", "present", "kind"),
-    [(74, "sluggish", "quiet"), (36, "nearly unstable", "loads"), (42, "sluggish", "valve that sticks")],
+    [
+        (74, "sluggish", "quiet"),
+        (36, "nearly unstable", "loads"),
+        (42, "sluggish", "valve that sticks"),
+        (38, "sluggish", "drift"),
+    ],
 )
 def test_the_gains_are_right_or_none(number: int, present: str, kind: str) -> None:
     """Plants drawn at random. Ms was wrong by 0.11 for the first one, on a structure too simple to have a rival, by
     0.26 for the second one, on changes cut to a third of the ultimate period, and by 0.20 for the third one, whose
-    valve made the plant seem weaker."""
+    valve made the plant seem weaker, and by 0.15 for the fourth one, whose drift the best model took for a gain of the
+    wrong sign, which left a worse one."""
     found = history_of(random_plant(number), present, kind, 1)
     assert found.changes is None or found.error < 0.1
 

@@ -5,13 +5,15 @@ Seven structures are fitted, and the Bayesian information criterion (BIC) choose
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 
 import numpy as np
 
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
+from loopwright.tuning.fast.uncertainty import durbin_watson_ratio, unknown_columns
 from loopwright.tuning.identification.disturbances import (
     by_bic,
     disturbance_candidates,
@@ -64,6 +66,13 @@ def choose_structure(fit: Fit[ExperimentRecord], known: Sequence[Fitted] = ()) -
         one_load = with_one_load(fit, undisturbed, known)
         found = preferred(undisturbed, one_load)
         others = undisturbed if found is one_load else one_load
+    elif fit.record.excitation is Excitation.OBSERVE and (
+        not _gain_has_the_right_sign(fit, first) or _drifts(fit, first)
+    ):
+        # Nobody waited for a steady load before an operator's change. What drifts leaves little in the residual, and
+        # MV that makes up for it, which the model takes for a gain of the wrong sign.
+        drift = with_drift(fit, undisturbed, known)
+        found = min(undisturbed, drift, key=partial(_bic_of_an_explanation, fit))
     elif _slow(fit, first):
         # The noise limits how well MV at rest is known; an error of MV at rest makes a slow plant drift.
         found = min(undisturbed, with_drift(fit, undisturbed, known), key=lowest_bic)
@@ -84,6 +93,26 @@ def _slow(fit: Fit[ExperimentRecord], found: Fitted) -> bool:
     """Whether the slowest lag is too long for the relay's record to show it completely."""
     poles = np.roots(np.append(1.0, found.structure.monic(found.theta[: found.structure.searched])))
     return bool(np.min(np.abs(poles)) < 1.0 / (SLOW_LAG * fit.period))
+
+
+def _drifts(fit: Fit[ExperimentRecord], found: Fitted) -> bool:
+    """Whether a slope of PV in each piece explains more of the residual than chance would, by AIC: two variances of the
+    noise for each of them."""
+    structure, pieces = found.structure, len(fit.pieces)
+    everything = fit.regressors(structure, replace(found.hypothesis, drift=True), found.theta[None])[0]
+    slopes = everything[:, structure.inputs + pieces : structure.inputs + 2 * pieces]
+    known = np.linalg.qr(unknown_columns(fit, found))[0]
+    basis = np.linalg.qr(slopes - known @ (known.T @ slopes))[0]
+    residual = found.linear.residual
+    variance = found.linear.rss / max(fit.samples - found.parameters, 1) * durbin_watson_ratio(residual)
+    return bool(np.sum((basis.T @ residual) ** 2) > 2.0 * pieces * variance)
+
+
+def _bic_of_an_explanation(fit: Fit[ExperimentRecord], fits: Sequence[Fitted]) -> float:
+    """The lowest BIC of a model whose static gain has the right sign. Slopes of several pieces count by what chance
+    makes of them, as their starts do: they are of no interest."""
+    slopes = len(fit.pieces) * (math.log(fit.samples) - 2.0) if fits[0].hypothesis.drift else 0.0
+    return min((each.bic for each in fits if _gain_has_the_right_sign(fit, each)), default=math.inf) - slopes
 
 
 def _unexplained(fit: Fit[ExperimentRecord], best: Fitted) -> bool:
