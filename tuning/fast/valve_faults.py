@@ -19,9 +19,10 @@ from loopwright.tuning.models import Reals, TransferFunction
 SIZES = (0.03, 0.06, 0.11, 0.19, 0.31)  # of MV's largest move
 MIN_STICTION = 0.04
 """Smallest stiction, as a fraction of the largest deviation of MV. A smaller one cannot be told from a plant that is
-none of the structures, and does not change Ms."""
+none of the structures, and does not change Ms where a test moves MV."""
 SMALL = (0.01, 0.02, 0.03)
-"""Sizes of a fault, as fractions of the largest deviation of MV, that a sound valve may have and that may change Ms."""
+"""Sizes of a fault, as fractions of the largest deviation of MV, that a sound valve may have. They change Ms where MV
+moves little."""
 SATURATIONS, MAX_SATURATION = (0.55, 0.7, 0.85), 0.96
 FIRST_STEPS, STEPS = 4, 10
 REFINED = (1.25, 1.1, 1.04)
