@@ -65,10 +65,9 @@ def drawn(path: Path) -> None:
     shown = [(n, each, each.evaluation) for n, each in enumerate(found, start=1) if each.evaluation is not None]
     for number, each, evaluation in shown:
         at = ((number + 1) * every - 2) * history.Ts / operated.Pu
-        spread = max(evaluation.uncertainty, evaluation.ambiguity)
         proposed = each.reason is None
         bottom.errorbar(
-            at, evaluation.Ms, spread, color=style.AFTER if proposed else style.BEFORE, marker="o", markersize=5,
+            at, evaluation.Ms, each.known_to, color=style.AFTER if proposed else style.BEFORE, marker="o", markersize=5,
             markerfacecolor=None if proposed else "white", capsize=4, linewidth=1.3,
         )  # fmt: skip
         true = margins(operated.model(), evaluation.best.gains).Ms

@@ -276,9 +276,7 @@ def operation_fields(found: Observation, compared: Comparison | None, present: G
 def _in_words(evaluation: Evaluation | None, found: Observation) -> str:
     if evaluation is None:
         return "Ms is not known"
-    doubt = None if found.models is None else found.models.doubt(evaluation.best.gains)
-    known = max(evaluation.uncertainty, evaluation.ambiguity) if doubt is None else doubt.whole
-    count = len(found.used)
+    known, count = found.known_to, len(found.used)
     at_best = "at best " if found.reason is not None else ""
     return f"Ms known to +-{known:.2g} {at_best}from {count} set-point change{'s' * (count != 1)}"
 

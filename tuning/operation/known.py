@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
@@ -20,8 +18,6 @@ def known_plant(found: Observation, sample_time_s: float, age_s: float) -> Obser
         return NothingKnown(found.detail)
     evaluation, used = found.evaluation, found.used
     record = evaluation.fit.record
-    doubt = None if found.models is None else found.models.doubt(evaluation.best.gains)
-    uncertainty = math.inf if doubt is None else doubt.whole
     return ObservedPlant(
         record=record,
         together=max(1, round(record.Ts / sample_time_s)),
@@ -29,7 +25,7 @@ def known_plant(found: Observation, sample_time_s: float, age_s: float) -> Obser
         pv=_range([each.stretch.pv[each.samples] for each in used]),
         mv=_range([each.stretch.mv[each.samples] for each in used]),
         age_s=age_s,
-        source=f"{len(used)} set-point changes of normal operation, from which Ms is known to +-{uncertainty:.2g}",
+        source=f"{len(used)} set-point changes of normal operation, from which Ms is known to +-{found.known_to:.2g}",
     )
 
 

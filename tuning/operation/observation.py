@@ -76,6 +76,14 @@ class Observation:
     dropped: tuple[SetpointChange, ...] = ()
     models: PlausibleModels | None = None
 
+    @property
+    def known_to(self) -> float | None:
+        """How far Ms of the designed gains may be off, at best where none are proposed; None without a model."""
+        if self.evaluation is None:
+            return None
+        doubt = None if self.models is None else self.models.doubt(self.evaluation.best.gains)
+        return max(self.evaluation.uncertainty, self.evaluation.ambiguity) if doubt is None else doubt.whole
+
 
 def observe(stretches: Sequence[Stretch], reverse: bool, spec: DesignSpec) -> Observation:
     """What the stretches of operation, oldest first and of one sample time, tell of the best gains.
