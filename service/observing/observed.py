@@ -33,12 +33,11 @@ from loopwright.tuning.fast.evaluation import Evaluation
 from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.procedure import FAST
 from loopwright.tuning.fast.proposal import comparison_of, identified_model, load_disturbances, ultimate
-from loopwright.tuning.fast.robustness import known_Ms
+from loopwright.tuning.fast.robustness import KnownMs
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.operation.history import SetpointChange
 from loopwright.tuning.operation.known import known_plant
 from loopwright.tuning.operation.observation import Observation, observe
-from loopwright.tuning.operation.plausible_models import PlausibleModels
 from loopwright.tuning.reasons import Reason, Refused
 
 NEVER_TRIED = (
@@ -264,8 +263,8 @@ def operation_fields(found: Observation, compared: Comparison | None, present: G
         "mv_range": _range([each.stretch.mv[each.samples] for each in used]),
         "model": None if evaluation is None else identified_model(evaluation.fit, evaluation.chosen.best),
         "residual": None if evaluation is None else evaluation.residual,
-        "present": _known(trusted, found.models, present),
-        "proposed": None if designed is None else _known(designed, found.models, designed.best.gains),
+        "present": _known(None if trusted is None else found.known_Ms(present), present),
+        "proposed": None if designed is None else _known(found.known_Ms(designed.best.gains), designed.best.gains),
         "ultimate": None if evaluation is None else ultimate(evaluation.model),
         "predicted": None if compared is None else predicted(compared.after),
         "predicted_before": predicted(compared.before) if compared is not None and compared.before.stable else None,
@@ -281,10 +280,7 @@ def _in_words(evaluation: Evaluation | None, found: Observation) -> str:
     return f"Ms known to +-{known:.2g} {at_best}from {count} set-point change{'s' * (count != 1)}"
 
 
-def _known(evaluation: Evaluation | None, models: PlausibleModels | None, gains: Gains) -> dict[str, object]:
-    found = None
-    if evaluation is not None:
-        found = known_Ms(evaluation, gains) if models is None else models.known_Ms(gains)
+def _known(found: KnownMs | None, gains: Gains) -> dict[str, object]:
     return {
         "gains": gains,
         "Ms": found.Ms if found else None,

@@ -20,7 +20,9 @@ from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation, evaluate
 from loopwright.tuning.fast.record import MIN_LISTENED, Excitation, ExperimentRecord, noise_of
 from loopwright.tuning.fast.record_evaluation import PERIOD_IS_RIGHT, first_period
+from loopwright.tuning.fast.robustness import KnownMs, known_Ms
 from loopwright.tuning.fast.score_tests import STANDARD_DEVIATIONS, ScoreTests, since
+from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Reals
 from loopwright.tuning.operation.consistency import consistent
 from loopwright.tuning.operation.history import (
@@ -79,10 +81,13 @@ class Observation:
     @property
     def known_to(self) -> float | None:
         """How far Ms of the designed gains may be off, at best where none are proposed; None without a model."""
-        if self.evaluation is None:
-            return None
-        doubt = None if self.models is None else self.models.doubt(self.evaluation.best.gains)
-        return max(self.evaluation.uncertainty, self.evaluation.ambiguity) if doubt is None else doubt.whole
+        return None if self.evaluation is None else self.known_Ms(self.evaluation.best.gains).uncertainty
+
+    def known_Ms(self, gains: Gains) -> KnownMs:
+        """Ms of these gains, with everything that may be wrong of it as far as that was looked at."""
+        if self.models is not None:
+            return self.models.known_Ms(gains)
+        return KnownMs(None, None) if self.evaluation is None else known_Ms(self.evaluation, gains)
 
 
 def observe(stretches: Sequence[Stretch], reverse: bool, spec: DesignSpec) -> Observation:
