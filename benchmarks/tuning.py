@@ -298,6 +298,7 @@ def _part(text: str) -> tuple[int, int]:
 
 
 def numbers_of(text: str) -> range:
+    """The numbers of "FIRST-LAST", or from 1 to the one given."""
     first, _, last = text.rpartition("-")
     return range(int(first or 1), int(last) + 1)
 
