@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.tuning.analysis.zero_order_hold import pulses
+from loopwright.tuning.identification.projection import REDUNDANT, Block, Projection
 from loopwright.tuning.identification.structures import Structure
-from loopwright.tuning.identification.variable_projection import REDUNDANT, LinearFit, SearchBounds, descend, solve
+from loopwright.tuning.identification.variable_projection import LinearFit, SearchBounds, descend, solve
 from loopwright.tuning.models import Reals, TransferFunction
 
 FLOOR = 2e-4
@@ -138,6 +139,7 @@ class Fit(Generic[S]):
         self.samples = len(self.y)
         self.period = record.period
         self._step = np.ones(len(self.u))
+        self._longest = max(piece.stop - piece.start for piece in self.pieces)
         self._level, self._slope = (
             averaged(_of_each_piece(self.pieces, function), self.block)
             for function in (np.ones, lambda length: np.linspace(-1.0, 1.0, length))
@@ -182,7 +184,8 @@ class Fit(Generic[S]):
             at += len(self.pieces)
         if not steps:
             return out
-        moved = averaged(stepped.drive(self._step), self.block, 1)
+        # a start ends with its piece
+        moved = averaged(stepped.drive(self._step if loads else self._step[: self._longest]), self.block, 1)
         for k in range(loads):
             load = out[:, :, at : at + order]
             load[:] = moved[k * many : (k + 1) * many]
@@ -193,6 +196,17 @@ class Fit(Generic[S]):
             out[:, rows, at : at + order] = moved[loads * many :, : rows.stop - rows.start]
             at += order
         return out
+
+    def blocks(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> list[Block]:
+        """The regressors of each of several pieces: its level, its slope where PV drifts, and its start."""
+        if not self.starts_are_free:
+            return []
+        pieces, order = len(self.pieces), structure.order
+        levels = structure.inputs + pieces * np.arange(1 + hypothesis.drift)
+        starts = self.first_load(structure, hypothesis) + order * hypothesis.load_disturbances + np.arange(order)
+        found = [Block(rows, np.append(levels + i, starts + order * i)) for i, rows in enumerate(self.rows)]
+        # the rows of a very short piece do not span its own regressors
+        return [block for block in found if block.rows.stop - block.rows.start > len(block.columns)]
 
     def _delayed(self, delay: NDArray[np.int64]) -> Reals:
         """MV a sample and the whole samples of the dead time later, shape (plants, N); 0 before each piece."""
@@ -254,7 +268,8 @@ class Fit(Generic[S]):
             return self.regressors(structure, hypothesis, thetas)
 
         bounded = SearchBounds(low, high, max_step, step)
-        found, rss = descend(columns, self.y, np.array(starts), bounded, max_steps, RELATIVE_DECREASE)
+        blocks = self.blocks(structure, hypothesis)
+        found, rss = descend(columns, self.y, np.array(starts), bounded, max_steps, RELATIVE_DECREASE, blocks)
         return [found[i] for i in np.argsort(rss, kind="stable")]
 
     def bounds(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> tuple[Reals, Reals]:
@@ -309,10 +324,14 @@ class Fit(Generic[S]):
         if load_at is not None:
             hypothesis = DisturbanceHypothesis(load_disturbances=1)
             thetas = [np.append(theta, load_at) for theta in thetas]
-        together = len(thetas) if len(self.pieces) == 1 else GRID_TOGETHER
+        together = GRID_TOGETHER if self.starts_are_free else len(thetas)
         parts = [np.array(thetas[i : i + together]) for i in range(0, len(thetas), together)]
-        rss = np.concatenate([sums_of_squares_left(self.regressors(structure, hypothesis, p), self.y) for p in parts])
+        rss = np.concatenate([self._sums_of_squares_left(structure, hypothesis, part) for part in parts])
         return self.distinct([thetas[i] for i in np.argsort(rss)], structure, keep)
+
+    def _sums_of_squares_left(self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals) -> Reals:
+        columns, blocks = self.regressors(structure, hypothesis, thetas), self.blocks(structure, hypothesis)
+        return Projection.of(columns, self.y, blocks).rss if blocks else sums_of_squares_left(columns, self.y)
 
     def distinct(self, ranked: Sequence[Reals], structure: Structure, keep: int) -> list[Reals]:
         """The first `keep` of the ranked theta that are not close to an earlier one."""

@@ -8,24 +8,20 @@ dominates.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from loopwright.tuning.identification.projection import Block, Projection, Rows
 from loopwright.tuning.models import Reals
 
-Rows = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 MAX_TRIES = 12
 FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-12
 MIN_PROMISED_DECREASE = 0.1
 """Smallest decrease that a step must promise to be tried, as a fraction of the decrease at which a search ends."""
 MIN_SLOPE = 1e-9
 """Smallest slope of a parameter, as a fraction of the largest slope; a smaller one is a rounding error."""
-REDUNDANT = 1e-10
-"""Size of a direction, in columns of unit length, below which it is a linear combination of the others."""
 MIN_SINGULAR = 1e-9
 """Relative singular value, of columns of unit length, below which the data do not show a direction."""
 
@@ -68,44 +64,6 @@ class SearchBounds:
     step: Reals
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Projected:
-    """The best linear fit of y at each point.
-
-    columns: the regressors, shape (points, N, columns).
-    basis: an orthonormal basis of the columns, of the same shape.
-    linear: the linear coefficients, shape (points, columns).
-    rest: the residual, shape (points, N).
-    """
-
-    columns: Reals
-    basis: Reals
-    linear: Reals
-    rest: Reals
-
-    @staticmethod
-    def of(columns: Reals, y: Reals) -> _Projected:
-        lengths = np.sqrt(np.einsum("bij,bij->bj", columns, columns))
-        lengths[lengths == 0.0] = 1.0
-        basis, r = np.linalg.qr(columns / lengths[:, None, :])
-        along = y @ basis
-        rest = y - (basis @ along[:, :, None])[:, :, 0]
-        return _Projected(columns, basis, _back(r, along) / lengths, rest)
-
-    @property
-    def rss(self) -> Reals:
-        return np.asarray(np.einsum("bi,bi->b", self.rest, self.rest))
-
-    def replaced(self, where: Rows, by: _Projected, which: Rows | Flags) -> None:
-        for mine, other in (
-            (self.columns, by.columns),
-            (self.basis, by.basis),
-            (self.linear, by.linear),
-            (self.rest, by.rest),
-        ):
-            mine[where] = other[which]
-
-
 def descend(
     columns_of: Callable[[Reals], Reals],
     y: Reals,
@@ -113,6 +71,7 @@ def descend(
     bounded: SearchBounds,
     max_steps: int,
     relative_decrease: float,
+    blocks: Sequence[Block] = (),
 ) -> tuple[Reals, Reals]:
     """The local minimum of the sum of squares that each start leads to: (the points, the sums of squares there).
 
@@ -122,10 +81,11 @@ def descend(
     bounded: the limits of the search.
     max_steps: the largest number of iterations.
     relative_decrease: a search ends when an iteration lowers its sum of squares by less than this fraction.
+    blocks: which of the regressors are 0 outside which part of the rows.
     """
     low, high, max_step = bounded.low, bounded.high, bounded.max_step
     at = np.clip(starts, low, high)
-    here = _Projected.of(columns_of(at), y)
+    here = Projection.of(columns_of(at), y, blocks)
     cost = here.rss
     damping = np.full(len(at), FIRST_DAMPING)
     one = np.eye(at.shape[1])
@@ -158,11 +118,11 @@ def descend(
             if not len(trying):
                 break
             new = np.clip(at[mine] + np.clip(move / scale[trying], -max_step, max_step), low, high)
-            there = _Projected.of(columns_of(new), y)
+            there = Projection.of(columns_of(new), y, blocks)
             better = there.rss < cost[mine]
             won = mine[better]
             at[won], cost[won] = new[better], there.rss[better]
-            here.replaced(won, there, better)
+            here.replace(won, there, better)
             damping[won] = np.maximum(0.2 * damping[won], MIN_DAMPING)
             damping[mine[~better]] *= 4.0
             trying = trying[~better]
@@ -173,30 +133,17 @@ def descend(
 
 
 def _slopes(
-    columns_of: Callable[[Reals], Reals], at: Reals, here: _Projected, which: Rows, bounded: SearchBounds
+    columns_of: Callable[[Reals], Reals], at: Reals, here: Projection, which: Rows, bounded: SearchBounds
 ) -> Reals:
     """The slopes of the residuals at these points by each parameter, shape (points, N, parameters)."""
     points, count = at[which], at.shape[1]
     signed = np.where(points + bounded.step <= bounded.high, bounded.step, -bounded.step)
     moved = points[:, None, :] + signed[:, :, None] * np.eye(count)
     columns = columns_of(moved.reshape(-1, count))
-    linear, basis = here.linear[which], here.basis[which]
-    fitted = (here.columns[which] @ linear[:, :, None])[:, :, 0]
+    linear = here.linear[which]
     answers = np.matmul(columns.reshape(len(points), count, *columns.shape[1:]), linear[:, None, :, None])[..., 0]
-    change = np.swapaxes((answers - fitted[:, None, :]) / signed[:, :, None], 1, 2)
-    return np.asarray(basis @ (np.swapaxes(basis, 1, 2) @ change) - change)
-
-
-def _back(r: Reals, along: Reals) -> Reals:
-    """The solutions c of R c = along, where a redundant direction gets the solution of least size."""
-    seen = np.abs(np.einsum("bii->bi", r)).min(axis=1) > REDUNDANT
-    if seen.all():
-        return np.asarray(np.linalg.solve(r, along[:, :, None])[:, :, 0])
-    found = np.empty_like(along)
-    found[seen] = np.linalg.solve(r[seen], along[seen, :, None])[:, :, 0]
-    for i in np.flatnonzero(~seen):
-        found[i] = np.linalg.lstsq(r[i], along[i], rcond=REDUNDANT)[0]
-    return found
+    change = np.swapaxes((answers - here.fitted(which)[:, None, :]) / signed[:, :, None], 1, 2)
+    return -here.beyond(change, which)
 
 
 def covariance(columns: Reals, variance: float) -> Reals:

@@ -84,5 +84,24 @@ def test_levels_and_starts_belong_to_one_piece_each() -> None:
         assert np.all(columns[rows, 1 + i] == 1.0)
 
 
+@pytest.mark.parametrize("loads", [0, 1])
+@pytest.mark.parametrize("drift", [False, True])
+def test_what_belongs_to_one_piece_is_known_under_every_hypothesis(loads: int, drift: bool) -> None:
+    fit = Fit(record())
+    hypothesis = DisturbanceHypothesis(load_disturbances=loads, drift=drift)
+    theta = np.array([np.log(1.0 / T1 + 1.0 / T2), np.log(1.0 / (T1 * T2)), DELAY, *[LENGTHS[0] + 40.0] * loads])
+    columns = fit.regressors(SECOND, hypothesis, theta[None])[0]
+    blocks = fit.blocks(SECOND, hypothesis)
+    assert [block.rows for block in blocks] == fit.rows
+    assert all(len(block.columns) == 1 + drift + SECOND.order for block in blocks)
+    for block in blocks:
+        outside = np.delete(columns[:, block.columns], block.rows, axis=0)
+        assert np.all(outside == 0.0) and np.all(np.any(columns[:, block.columns] != 0.0, axis=0))
+    common = np.setdiff1d(np.arange(columns.shape[1]), np.concatenate([block.columns for block in blocks]))
+    first = fit.first_load(SECOND, hypothesis)
+    expected = [*range(SECOND.inputs), *range(first, first + SECOND.order * loads)]
+    assert common.tolist() == expected
+
+
 def _fields(found: ExperimentRecord) -> dict[str, object]:
     return {name: getattr(found, name) for name in found.__dataclass_fields__}
