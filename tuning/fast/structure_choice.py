@@ -67,10 +67,10 @@ def choose_structure(fit: Fit[ExperimentRecord], known: Sequence[Fitted] = ()) -
         found = preferred(undisturbed, one_load)
         others = undisturbed if found is one_load else one_load
     elif fit.record.excitation is Excitation.OBSERVE and (
-        not _gain_has_the_right_sign(fit, first) or _drifts(fit, first)
+        not _gain_has_the_right_sign(fit, first) or _drifts(fit, first) or _slow(fit, first)
     ):
         # Nobody waited for a steady load before an operator's change. What drifts leaves little in the residual, and
-        # MV that makes up for it, which the model takes for a gain of the wrong sign.
+        # MV that makes up for it, which the model takes for a gain of the wrong sign, or for a lag that never ends.
         drift = with_drift(fit, undisturbed, known)
         found = min(undisturbed, drift, key=partial(_bic_of_an_explanation, fit))
     elif _slow(fit, first):
@@ -90,7 +90,7 @@ def _gain_has_the_right_sign(fit: Fit[ExperimentRecord], found: Fitted) -> bool:
 
 
 def _slow(fit: Fit[ExperimentRecord], found: Fitted) -> bool:
-    """Whether the slowest lag is too long for the relay's record to show it completely."""
+    """Whether the slowest lag is too long for the record of a relay, or a set-point change, to show it completely."""
     poles = np.roots(np.append(1.0, found.structure.monic(found.theta[: found.structure.searched])))
     return bool(np.min(np.abs(poles)) < 1.0 / (SLOW_LAG * fit.period))
 
