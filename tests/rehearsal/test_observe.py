@@ -77,6 +77,30 @@ def test_three_changes_give_the_gains_asked_for(plant: TransferFunction | FOPDT,
     assert found.evaluation.uncertainty < 0.06
 
 
+def test_how_far_Ms_may_be_off_is_what_each_model_left_says() -> None:
+    history = operated(LAG, Gains(0.4, 12.0), changes([0.8, -0.3, 0.6], 300.0))
+    models = observe([history], True, ASKED).models
+    assert models is not None and len(models.left_out) == 3 and models.others
+    gains = Gains(0.9, 11.0)
+
+    def Ms(model: TransferFunction) -> float:
+        return margins(replace(model, L=model.L + models.evaluation.design_delay), gains).Ms
+
+    doubt, nominal = models.doubt(gains), Ms(models.evaluation.model)
+    assert doubt is not None
+    for found, among in (
+        (doubt.on_others, models.others),
+        (doubt.left_out, models.left_out),
+        (doubt.on_valve, models.valve),
+    ):
+        assert found == pytest.approx(max(abs(Ms(each) - nominal) for each in among), abs=2e-3)
+    assert models.known_Ms(gains).Ms == pytest.approx(nominal, abs=2e-3)
+    assert models.known_Ms(gains).uncertainty == pytest.approx(
+        np.sqrt(doubt.standard_error**2 + doubt.on_others**2 + doubt.left_out**2 + doubt.on_valve**2)
+    )
+    assert models.doubt(Gains(20.0, 11.0)) is None, "unstable"
+
+
 def test_a_change_with_a_load_disturbance_in_it_is_left_out() -> None:
     sp = changes([0.8, -0.3, 0.6, 0.1], 200.0)
     load = np.where(np.arange(len(sp)) * TS > 415.0, 0.4, 0.0)  # 15 s after the second change

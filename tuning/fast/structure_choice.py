@@ -40,8 +40,8 @@ class StructureChoice:
     """The structure chosen, with its competitors.
 
     best: the fit that the design uses.
-    rivals: fits of other structures, in manual also of one load disturbance more or less, whose BIC is within RIVAL_BIC
-    of the best.
+    rivals: fits of other structures, in manual also of one load disturbance more or less, in operation also with or
+    without a drift, whose BIC is within RIVAL_BIC of the best.
     fits: all fits under the disturbance hypothesis of the best one.
     """
 
@@ -72,7 +72,8 @@ def choose_structure(fit: Fit[ExperimentRecord], known: Sequence[Fitted] = ()) -
         # Nobody waited for a steady load before an operator's change. What drifts leaves little in the residual, and
         # MV that makes up for it, which the model takes for a gain of the wrong sign, or for a lag that never ends.
         drift = with_drift(fit, undisturbed, known)
-        found = min(undisturbed, drift, key=partial(_bic_of_an_explanation, fit))
+        found, less_likely = sorted((undisturbed, drift), key=partial(_bic_of_an_explanation, fit))
+        others = [each for each in less_likely if _gain_has_the_right_sign(fit, each)]
     elif _slow(fit, first):
         # The noise limits how well MV at rest is known; an error of MV at rest makes a slow plant drift.
         found = min(undisturbed, with_drift(fit, undisturbed, known), key=lowest_bic)
@@ -109,10 +110,8 @@ def _drifts(fit: Fit[ExperimentRecord], found: Fitted) -> bool:
 
 
 def _bic_of_an_explanation(fit: Fit[ExperimentRecord], fits: Sequence[Fitted]) -> float:
-    """The lowest BIC of a model whose static gain has the right sign. Slopes of several pieces count by what chance
-    makes of them, as their starts do: they are of no interest."""
-    slopes = len(fit.pieces) * (math.log(fit.samples) - 2.0) if fits[0].hypothesis.drift else 0.0
-    return min((each.bic for each in fits if _gain_has_the_right_sign(fit, each)), default=math.inf) - slopes
+    """The lowest BIC of a model whose static gain has the right sign."""
+    return min((each.bic for each in fits if _gain_has_the_right_sign(fit, each)), default=math.inf)
 
 
 def _unexplained(fit: Fit[ExperimentRecord], best: Fitted) -> bool:

@@ -233,8 +233,8 @@ class Fit(Generic[S]):
         parameters = len(theta) + columns.shape[1] + hypothesis.load_disturbances
         penalty = parameters * math.log(self.samples)
         if self.starts_are_free:
-            # the states at the start of the pieces are of no interest: they count by what chance makes of them (AIC)
-            penalty -= structure.order * len(self.pieces) * (math.log(self.samples) - 2.0)
+            # the start and the slope of each piece are of no interest: they count by what chance makes of them (AIC)
+            penalty -= (structure.order + hypothesis.drift) * len(self.pieces) * (math.log(self.samples) - 2.0)
         bic = self.samples * math.log(linear.rss / self.samples + FLOOR**2) + penalty
         return Fitted(structure, hypothesis, theta, columns, linear, bic)
 

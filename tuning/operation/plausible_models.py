@@ -64,8 +64,14 @@ class PlausibleModels:
     def doubt(self, gains: Gains) -> Doubt | None:
         """How far Ms of these gains may be off; None where the loop is not stable on the model."""
         Ms = known_Ms(self.evaluation, gains).Ms
-        if Ms is None:
-            return None
+        return None if Ms is None else self._doubt(gains, Ms)
+
+    def known_Ms(self, gains: Gains) -> KnownMs:
+        """Ms of these gains on the model, with everything that may be wrong of it."""
+        Ms = known_Ms(self.evaluation, gains).Ms
+        return KnownMs(Ms, None if Ms is None else self._doubt(gains, Ms).whole)
+
+    def _doubt(self, gains: Gains, Ms: float) -> Doubt:
         fit, w, delay = self.evaluation.fit, frequencies(self.evaluation.period), self.evaluation.design_delay
 
         def difference(models: Sequence[TransferFunction]) -> float:
@@ -73,11 +79,6 @@ class PlausibleModels:
 
         error = uncertainty_of_Ms(fit, self.evaluation.chosen.best, gains, w, filter_ratio(gains), delay)
         return Doubt(error, *map(difference, (self.others, self.left_out, self.valve)))
-
-    def known_Ms(self, gains: Gains) -> KnownMs:
-        """Ms of these gains on the model, with everything that may be wrong of it."""
-        doubt = self.doubt(gains)
-        return KnownMs(known_Ms(self.evaluation, gains).Ms, None if doubt is None else doubt.whole)
 
 
 def plausible_models(evaluation: Evaluation) -> PlausibleModels:
