@@ -17,7 +17,8 @@ Errors        Refused (with a Reason, and what to do about it)
 
 Times are in s, gains in ISA form: u = Kp (b SP - PV + integral(SP - PV)/Ti + Td d/dt(c SP - PV)/(1 + Tf s)).
 The library is pure: no clock, no input or output. The procedures that tune live loops are `tuning.fast` and
-`tuning.five_stage`.
+`tuning.five_stage`. Its matrices are small, and the threads of BLAS make it slower, tens of times on a busy machine:
+set OPENBLAS_NUM_THREADS=1 in the environment before numpy is imported.
 """
 
 from importlib import import_module

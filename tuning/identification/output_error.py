@@ -145,7 +145,7 @@ class Fit(Generic[S]):
             for function in (np.ones, lambda length: np.linspace(-1.0, 1.0, length))
         )
         self._rate = math.log(1.0 / self.period)
-        self._grids: dict[tuple[Structure, int, float | None, tuple[float, ...]], list[Reals]] = {}
+        self._grids: dict[tuple[Structure, int, float | None, tuple[float, ...], bool], list[Reals]] = {}
 
     # what is fitted
 
@@ -303,26 +303,27 @@ class Fit(Generic[S]):
         keep: int,
         load_at: float | None = None,
         dead_times: Sequence[float] = DEAD_TIMES,
+        drift: bool = False,
     ) -> list[Reals]:
         """The `keep` best distinct theta of a grid, best first. Several disturbance hypotheses begin with one grid.
 
         load_at: each theta has one load disturbance at this sample, None for none.
         dead_times: the dead times of the grid, in periods.
+        drift: whether PV drifts; it counts where a record has several pieces, whose slopes move PV more than its model.
         """
-        asked = structure, keep, load_at, tuple(dead_times)
+        asked = structure, keep, load_at, tuple(dead_times), drift and self.starts_are_free
         if asked not in self._grids:
-            self._grids[asked] = self._best_of_grid(structure, keep, load_at, dead_times)
+            self._grids[asked] = self._best_of_grid(*asked)
         return self._grids[asked]
 
     def _best_of_grid(
-        self, structure: Structure, keep: int, load_at: float | None, dead_times: Sequence[float]
+        self, structure: Structure, keep: int, load_at: float | None, dead_times: Sequence[float], drift: bool
     ) -> list[Reals]:
         thetas = [
             np.append(logs, max(L, 0.0) * self.period) for logs in self.denominators(structure) for L in dead_times
         ]
-        hypothesis = UNDISTURBED
+        hypothesis = DisturbanceHypothesis(load_disturbances=int(load_at is not None), drift=drift)
         if load_at is not None:
-            hypothesis = DisturbanceHypothesis(load_disturbances=1)
             thetas = [np.append(theta, load_at) for theta in thetas]
         together = GRID_TOGETHER if self.starts_are_free else len(thetas)
         parts = [np.array(thetas[i : i + together]) for i in range(0, len(thetas), together)]
