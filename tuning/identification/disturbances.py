@@ -145,9 +145,7 @@ def fit_structures(
         if hypothesis.load_disturbances == 1:
             begun[_poles(lags)] = fit.grid(lags, STARTS, float(times[0]))
         else:
-            begun[_poles(lags)] = [
-                np.append(theta, times) for theta in fit.grid(lags, STARTS, drift=hypothesis.drift)
-            ]
+            begun[_poles(lags)] = [np.append(theta, times) for theta in fit.grid(lags, STARTS, drift=hypothesis.drift)]
     found: list[Fitted] = []
     for structure in structures:
         same = [k.theta for k in known if _poles(k.structure) == _poles(structure) and k.hypothesis == hypothesis]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.tuning.analysis.zero_order_hold import pulses
-from loopwright.tuning.identification.projection import REDUNDANT, Block, Projection
+from loopwright.tuning.identification.projection import REDUNDANT, LocalRegressors, Projection
 from loopwright.tuning.identification.structures import Structure
 from loopwright.tuning.identification.variable_projection import LinearFit, SearchBounds, descend, solve
 from loopwright.tuning.models import Reals, TransferFunction
@@ -197,16 +197,16 @@ class Fit(Generic[S]):
             at += order
         return out
 
-    def blocks(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> list[Block]:
+    def local_regressors(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> list[LocalRegressors]:
         """The regressors of each of several pieces: its level, its slope where PV drifts, and its start."""
         if not self.starts_are_free:
             return []
         pieces, order = len(self.pieces), structure.order
         levels = structure.inputs + pieces * np.arange(1 + hypothesis.drift)
         starts = self.first_load(structure, hypothesis) + order * hypothesis.load_disturbances + np.arange(order)
-        found = [Block(rows, np.append(levels + i, starts + order * i)) for i, rows in enumerate(self.rows)]
+        found = [LocalRegressors(rows, np.append(levels + i, starts + order * i)) for i, rows in enumerate(self.rows)]
         # the rows of a very short piece do not span its own regressors
-        return [block for block in found if block.rows.stop - block.rows.start > len(block.columns)]
+        return [each for each in found if each.rows.stop - each.rows.start > len(each.columns)]
 
     def _delayed(self, delay: NDArray[np.int64]) -> Reals:
         """MV a sample and the whole samples of the dead time later, shape (plants, N); 0 before each piece."""
@@ -268,8 +268,8 @@ class Fit(Generic[S]):
             return self.regressors(structure, hypothesis, thetas)
 
         bounded = SearchBounds(low, high, max_step, step)
-        blocks = self.blocks(structure, hypothesis)
-        found, rss = descend(columns, self.y, np.array(starts), bounded, max_steps, RELATIVE_DECREASE, blocks)
+        local = self.local_regressors(structure, hypothesis)
+        found, rss = descend(columns, self.y, np.array(starts), bounded, max_steps, RELATIVE_DECREASE, local)
         return [found[i] for i in np.argsort(rss, kind="stable")]
 
     def bounds(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> tuple[Reals, Reals]:
@@ -331,8 +331,8 @@ class Fit(Generic[S]):
         return self.distinct([thetas[i] for i in np.argsort(rss)], structure, keep)
 
     def _sums_of_squares_left(self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals) -> Reals:
-        columns, blocks = self.regressors(structure, hypothesis, thetas), self.blocks(structure, hypothesis)
-        return Projection.of(columns, self.y, blocks).rss if blocks else sums_of_squares_left(columns, self.y)
+        columns, local = self.regressors(structure, hypothesis, thetas), self.local_regressors(structure, hypothesis)
+        return Projection.of(columns, self.y, local).rss if local else sums_of_squares_left(columns, self.y)
 
     def distinct(self, ranked: Sequence[Reals], structure: Structure, keep: int) -> list[Reals]:
         """The first `keep` of the ranked theta that are not close to an earlier one."""

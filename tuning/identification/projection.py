@@ -22,11 +22,11 @@ REDUNDANT = 1e-10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
+class LocalRegressors:
     """Regressors that are 0 outside a part of the rows.
 
-    rows: the part; no two blocks have a row in common.
-    columns: the places of these regressors among all, shape (columns of the block,).
+    rows: the part; no two of them have a row in common.
+    columns: the places of these regressors among all, shape (columns,).
     """
 
     rows: slice
@@ -38,42 +38,42 @@ class Projection:
     """The best linear fit of y by each set of regressors.
 
     columns: the regressors, shape (sets, N, columns).
-    blocks: which of the regressors are 0 outside which part, the same in all sets.
-    bases: an orthonormal basis of the regressors of each block, shapes (sets, rows, columns of the block).
-    common: an orthonormal basis of the other regressors, orthogonal to those of the blocks, shape (sets, N, others).
+    local: which of the regressors are 0 outside which part, the same in all sets.
+    bases: an orthonormal basis of the regressors of each part, shapes (sets, rows, columns).
+    common: an orthonormal basis of the other regressors, orthogonal to those of the parts, shape (sets, N, others).
     linear: the linear coefficients, shape (sets, columns).
     rest: the residual, shape (sets, N).
     """
 
     columns: Reals
-    blocks: Sequence[Block]
+    local: Sequence[LocalRegressors]
     bases: Sequence[Reals]
     common: Reals
     linear: Reals
     rest: Reals
 
     @staticmethod
-    def of(columns: Reals, y: Reals, blocks: Sequence[Block] = ()) -> Projection:
-        """columns: shape (sets, N, columns). y: shape (N,)."""
+    def of(columns: Reals, y: Reals, local: Sequence[LocalRegressors] = ()) -> Projection:
+        """The projection of y, shape (N,), on each set; columns and local as above."""
         sets, _, count = columns.shape
         lengths = np.sqrt(np.einsum("bij,bij->bj", columns, columns))
         lengths[lengths == 0.0] = 1.0
-        others = np.setdiff1d(np.arange(count), [i for block in blocks for i in block.columns])
+        others = np.setdiff1d(np.arange(count), [i for part in local for i in part.columns])
         common = columns[:, :, others] / lengths[:, None, others]
         rest = np.tile(y, (sets, 1))
         bases, solutions = list[Reals](), list[Reals]()
-        for block in blocks:
-            own = _Factors.of(columns[:, block.rows, block.columns] / lengths[:, None, block.columns])
+        for part in local:
+            own = _Factors.of(columns[:, part.rows, part.columns] / lengths[:, None, part.columns])
             # the directions of y and, for each of the other regressors, of that
-            along = [_take_out(own.basis, signal[:, block.rows]) for signal in (rest[:, :, None], common)]
+            along = [_take_out(own.basis, signal[:, part.rows]) for signal in (rest[:, :, None], common)]
             bases.append(own.basis)
             solutions.append(own.coefficients(np.concatenate(along, axis=2)))
         factors = _Factors.of(common)
         linear = np.empty((sets, count))
         linear[:, others] = factors.coefficients(_take_out(factors.basis, rest[:, :, None]))[:, :, 0]
-        for block, found in zip(blocks, solutions, strict=True):
-            linear[:, block.columns] = found[:, :, 0] - (found[:, :, 1:] @ linear[:, others, None])[:, :, 0]
-        return Projection(columns, blocks, bases, factors.basis, linear / lengths, rest)
+        for part, found in zip(local, solutions, strict=True):
+            linear[:, part.columns] = found[:, :, 0] - (found[:, :, 1:] @ linear[:, others, None])[:, :, 0]
+        return Projection(columns, local, bases, factors.basis, linear / lengths, rest)
 
     @property
     def rss(self) -> Reals:
@@ -86,8 +86,8 @@ class Projection:
     def beyond(self, signals: Reals, which: Rows) -> Reals:
         """What is left of the signals, shape (sets, N, signals), beyond the regressors of these sets."""
         left = signals.copy()
-        for block, basis in zip(self.blocks, self.bases, strict=True):
-            _take_out(basis[which], left[:, block.rows])
+        for part, basis in zip(self.local, self.bases, strict=True):
+            _take_out(basis[which], left[:, part.rows])
         _take_out(self.common[which], left)
         return left
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopwright.tuning.identification.projection import Block, Projection, Rows
+from loopwright.tuning.identification.projection import LocalRegressors, Projection, Rows
 from loopwright.tuning.models import Reals
 
 MAX_TRIES = 12
@@ -71,7 +71,7 @@ def descend(
     bounded: SearchBounds,
     max_steps: int,
     relative_decrease: float,
-    blocks: Sequence[Block] = (),
+    local: Sequence[LocalRegressors] = (),
 ) -> tuple[Reals, Reals]:
     """The local minimum of the sum of squares that each start leads to: (the points, the sums of squares there).
 
@@ -81,11 +81,11 @@ def descend(
     bounded: the limits of the search.
     max_steps: the largest number of iterations.
     relative_decrease: a search ends when an iteration lowers its sum of squares by less than this fraction.
-    blocks: which of the regressors are 0 outside which part of the rows.
+    local: which of the regressors are 0 outside which part of the rows.
     """
     low, high, max_step = bounded.low, bounded.high, bounded.max_step
     at = np.clip(starts, low, high)
-    here = Projection.of(columns_of(at), y, blocks)
+    here = Projection.of(columns_of(at), y, local)
     cost = here.rss
     damping = np.full(len(at), FIRST_DAMPING)
     one = np.eye(at.shape[1])
@@ -118,7 +118,7 @@ def descend(
             if not len(trying):
                 break
             new = np.clip(at[mine] + np.clip(move / scale[trying], -max_step, max_step), low, high)
-            there = Projection.of(columns_of(new), y, blocks)
+            there = Projection.of(columns_of(new), y, local)
             better = there.rss < cost[mine]
             won = mine[better]
             at[won], cost[won] = new[better], there.rss[better]

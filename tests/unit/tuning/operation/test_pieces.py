@@ -91,13 +91,13 @@ def test_what_belongs_to_one_piece_is_known_under_every_hypothesis(loads: int, d
     hypothesis = DisturbanceHypothesis(load_disturbances=loads, drift=drift)
     theta = np.array([np.log(1.0 / T1 + 1.0 / T2), np.log(1.0 / (T1 * T2)), DELAY, *[LENGTHS[0] + 40.0] * loads])
     columns = fit.regressors(SECOND, hypothesis, theta[None])[0]
-    blocks = fit.blocks(SECOND, hypothesis)
-    assert [block.rows for block in blocks] == fit.rows
-    assert all(len(block.columns) == 1 + drift + SECOND.order for block in blocks)
-    for block in blocks:
-        outside = np.delete(columns[:, block.columns], block.rows, axis=0)
-        assert np.all(outside == 0.0) and np.all(np.any(columns[:, block.columns] != 0.0, axis=0))
-    common = np.setdiff1d(np.arange(columns.shape[1]), np.concatenate([block.columns for block in blocks]))
+    local = fit.local_regressors(SECOND, hypothesis)
+    assert [each.rows for each in local] == fit.rows
+    assert all(len(each.columns) == 1 + drift + SECOND.order for each in local)
+    for each in local:
+        outside = np.delete(columns[:, each.columns], each.rows, axis=0)
+        assert np.all(outside == 0.0) and np.all(np.any(columns[:, each.columns] != 0.0, axis=0))
+    common = np.setdiff1d(np.arange(columns.shape[1]), np.concatenate([each.columns for each in local]))
     first = fit.first_load(SECOND, hypothesis)
     expected = [*range(SECOND.inputs), *range(first, first + SECOND.order * loads)]
     assert common.tolist() == expected
