@@ -56,6 +56,7 @@ def test_a_regressor_that_others_make_up_leaves_the_residual(redundant: int) -> 
     for i in SETS:
         rss = np.linalg.lstsq(np.delete(columns[i], redundant, axis=1), y, rcond=None)[1]
         assert np.isfinite(again.linear).all() and np.isfinite(less.linear).all()
+        assert [again.rss[i], less.rss[i]] == pytest.approx([rss[0]] * 2, rel=1e-9)
         assert again.columns[i] @ again.linear[i] == pytest.approx(again.fitted(SETS)[i], abs=1e-12)
         assert np.sum((y - again.fitted(SETS)[i]) ** 2) == pytest.approx(rss, rel=1e-9)
     assert (without.rss < again.rss).all()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, dlsim, tf2ss
@@ -9,6 +11,7 @@ from scipy.signal import cont2discrete, dlsim, tf2ss
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.identification.disturbances import by_bic, fit_structures
 from loopwright.tuning.identification.output_error import UNDISTURBED, DisturbanceHypothesis, Fit
+from loopwright.tuning.identification.projection import Projection
 from loopwright.tuning.identification.structures import FIRST, SECOND
 from loopwright.tuning.models import Reals
 
@@ -101,6 +104,18 @@ def test_what_belongs_to_one_piece_is_known_under_every_hypothesis(loads: int, d
     first = fit.first_load(SECOND, hypothesis)
     expected = [*range(SECOND.inputs), *range(first, first + SECOND.order * loads)]
     assert common.tolist() == expected
+
+
+def test_a_piece_of_fewer_samples_than_regressors_is_projected_out_with_the_common_ones() -> None:
+    whole = record()
+    short = replace(whole, u=whole.u[:503], y=whole.y[:503], excited=503, lengths=(300, 3, 200))
+    fit = Fit(short)
+    local = fit.local_regressors(SECOND, UNDISTURBED)
+    assert [each.rows for each in local] == [slice(0, 300), slice(303, 503)]
+    theta = np.array([np.log(1.0 / T1 + 1.0 / T2), np.log(1.0 / (T1 * T2)), DELAY])
+    found = fit.fitted(SECOND, UNDISTURBED, theta)
+    projected = Projection.of(found.columns[None], fit.y, local)
+    assert projected.rest[0] == pytest.approx(found.linear.residual, abs=1e-9)
 
 
 def _fields(found: ExperimentRecord) -> dict[str, object]:
