@@ -277,7 +277,8 @@ def _in_words(evaluation: Evaluation | None, found: Observation) -> str:
         return "Ms is not known"
     known, count = found.known_to, len(found.used)
     at_best = "at best " if found.reason is not None else ""
-    return f"Ms known to +-{known:.2g} {at_best}from {count} set-point change{'s' * (count != 1)}"
+    behind = "" if found.valve is None else f", behind {found.valve.in_words}"
+    return f"Ms known to +-{known:.2g} {at_best}from {count} set-point change{'s' * (count != 1)}{behind}"
 
 
 def _known(found: KnownMs | None, gains: Gains) -> dict[str, object]:

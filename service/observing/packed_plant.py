@@ -27,6 +27,7 @@ class PackedPlant(BaseModel):
     turns: int = 0
     period: float = 0.0
     lengths: list[int] = []
+    u_earlier: list[list[float]] = []
     held_s: float | None = None
     together: int = 0
     gains: GainsView | None = None
@@ -50,6 +51,7 @@ def pack(known: ObservedPlant | NothingKnown) -> bytes:
             turns=record.turns,
             period=record.period,
             lengths=list(record.lengths),
+            u_earlier=[each.tolist() for each in record.u_earlier],
             held_s=record.held_s,
             together=known.together,
             gains=GainsView.of(known.gains),
@@ -80,6 +82,7 @@ def unpack(data: bytes) -> ObservedPlant | NothingKnown:
         period=packed.period,
         excitation=Excitation.OBSERVE,
         lengths=tuple(packed.lengths),
+        u_earlier=tuple(map(np.array, packed.u_earlier)),
         held_s=packed.held_s,
     )
     gains = packed.gains.gains()

@@ -15,9 +15,12 @@ from loopwright.plantsim.plant import LinearPlant
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.controller_check import check_controller
 from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.known_plant import NothingKnown
+from loopwright.tuning.fast.valve_faults import stiction
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, Reals, TransferFunction
 from loopwright.tuning.operation.history import SetpointChange, Stretch
+from loopwright.tuning.operation.known import known_plant
 from loopwright.tuning.operation.observation import Observation, observe
 from loopwright.tuning.operation.setpoint_alone import mv_of_setpoint
 from loopwright.tuning.plan import Mode
@@ -27,6 +30,7 @@ TS = 0.2
 LAG = FOPDT(2.0, 10.0, 3.0)  # its ultimate period is about 11 s
 THIRD = TransferFunction((-1.5,), (24.0, 50.0, 14.0, 1.0), 2.0)
 PI = Gains(1.0, 9.0)
+SLUGGISH = Gains(0.25, 15.0)
 NOISE = 0.01
 ASKED = DesignSpec(1.6)
 
@@ -38,19 +42,22 @@ def operated(
     noise: float = NOISE,
     load: Reals | None = None,
     Ts: float = TS,
+    stiction: float = 0.0,
 ) -> Stretch:
-    """The history of a loop under the product's controller, from rest."""
+    """The history of a loop under the product's controller, from rest; the valve stays until MV is off by more than
+    `stiction`."""
     reverse = plant.static_gain > 0.0
     process = LinearPlant(plant.num, plant.den, plant.L, Ts, noise_std=noise, seed=3)
     settings = Settings(mv_low=-1e9, mv_high=1e9, pv_low=-1e9, pv_high=1e9, reverse=reverse)
     channel = Channel(Ts, settings, Parameters(gains.Kp, gains.Ti), 0.0, int(Mode.AUTOMATIC), 0.0)
-    rows, pv = [], process.pv
+    rows, pv, valve = [], process.pv, 0.0
     for k, setpoint in enumerate(sp):
         if setpoint != channel.setpoint:
             channel.setpoint = float(setpoint)
         mv = channel.step(pv)
         rows.append((mv, pv))
-        pv = process.step(mv + (0.0 if load is None else float(load[k])))
+        valve = mv if abs(mv - valve) > stiction else valve
+        pv = process.step(valve + (0.0 if load is None else float(load[k])))
     mv_column, pv_column = np.array(rows).T
     return Stretch(1000.0, Ts, mv_column, pv_column, sp, gains)
 
@@ -125,15 +132,41 @@ def test_changes_of_an_older_plant_are_left_out() -> None:
 
 def test_changes_of_an_older_plant_that_fit_the_others_one_by_one_are_left_out() -> None:
     """Under sluggish gains a plant whose gain is a quarter larger leaves no large residual in any one change."""
-    sluggish = Gains(0.25, 15.0)
-    before = operated(LAG, sluggish, changes([0.4, -0.3], 200.0))
+    before = operated(LAG, SLUGGISH, changes([0.4, -0.3], 200.0))
     changed = replace(LAG, K=1.25 * LAG.K)
-    after = replace(operated(changed, sluggish, changes([0.8, -0.3, 0.6, 0.0], 200.0)), t_s=5000.0)
+    after = replace(operated(changed, SLUGGISH, changes([0.8, -0.3, 0.6, 0.0], 200.0)), t_s=5000.0)
     found = observe([before, after], True, ASKED)
     assert found.reason is None, found.detail
     assert all(each.t_s > 5000.0 for each in found.used)
     assert (len(found.used), len(found.dropped)) == (4, 2)
     assert true_Ms(changed, found) == pytest.approx(1.6, abs=0.05)
+
+
+def test_changes_before_the_dead_time_became_longer_are_left_out() -> None:
+    before = operated(LAG, SLUGGISH, changes([0.4, -0.3], 200.0))
+    changed = replace(LAG, L=LAG.L + 1.2)
+    after = replace(operated(changed, SLUGGISH, changes([0.8, -0.3, 0.6, 0.0], 200.0)), t_s=5000.0)
+    found = observe([before, after], True, ASKED)
+    assert (len(found.used), len(found.dropped)) == (4, 2)
+    assert found.reason is not None or true_Ms(changed, found) == pytest.approx(1.6, abs=0.05)
+
+
+def test_a_valve_that_sticks_is_found_with_its_stiction_and_the_plant_behind_it() -> None:
+    sp = changes([0.8, -0.3, 0.6, -0.5, 0.2, 0.9], 200.0)
+    found = observe([operated(LAG, SLUGGISH, sp, stiction=0.02)], True, ASKED)
+    assert found.reason is None, found.detail
+    assert found.valve is not None and found.valve.fault is stiction
+    assert found.valve.size == pytest.approx(0.02, rel=0.05)
+    assert found.valve.in_words == "a valve that sticks until MV is off by about 0.02"
+    assert true_Ms(LAG, found) == pytest.approx(1.6, abs=0.05)
+    assert isinstance(known_plant(found, TS, 0.0), NothingKnown), "no trial is fitted together with such a record"
+
+
+def test_a_sound_valve_has_no_fault() -> None:
+    sp = changes([0.8, -0.3, 0.6, -0.5, 0.2, 0.9], 200.0)
+    found = observe([operated(LAG, SLUGGISH, sp)], True, ASKED)
+    assert found.reason is None, found.detail
+    assert found.valve is None
 
 
 def test_a_plant_of_which_only_the_latest_change_tells_that_it_is_another_one_gets_no_gains() -> None:

@@ -87,6 +87,7 @@ class ObservedPlant:
             period=period,
             steps=tuple(begun + (step - first) // self.together for step in steps),
             lengths=(*record.lengths, len(u)),
+            u_earlier=(*record.u_earlier, np.empty(0)) if record.u_earlier else (),
         )
 
     def _sampled(self, pv: Reals, mv: Reals) -> tuple[Reals, Reals]:

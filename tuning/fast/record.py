@@ -61,6 +61,8 @@ class ExperimentRecord:
     one_sided: whether the set-point went to one side of its rest only.
     control: what the record shows of the controller; None where it is not known.
     held_s: the time for which the controller holds MV, s; None where it is the sample time.
+    u_earlier: MV before each piece of several, as long as the longest dead time, as a deviation from the same rest as
+    its u; empty where MV was at rest.
     Raises Refused: BAD_INPUT, NO_RESPONSE.
     """
 
@@ -78,6 +80,7 @@ class ExperimentRecord:
     held_s: float | None = None
     one_sided: bool = False
     control: ControlRecord | None = None
+    u_earlier: tuple[Reals, ...] = ()
 
     @property
     def sampling_delay_s(self) -> float:

@@ -93,6 +93,7 @@ class ScoreTests:
     def __init__(self, fit: Fit[ExperimentRecord], found: Fitted) -> None:
         self._fit, self._found = fit, found
         known = unknown_columns(fit, found)
+        self._to_dead_time = known[:, found.structure.lags]
         lengths = np.linalg.norm(known, axis=0)
         basis, singular, _ = np.linalg.svd(known[:, lengths > 0.0] / lengths[lengths > 0.0], full_matrices=False)
         self._basis = basis[:, singular > NEGLIGIBLE_DIRECTION * singular[0]]
@@ -124,21 +125,31 @@ class ScoreTests:
         size, deviation = self.score(above_rest)
         return 2.0 * deviation + (abs(size) if abs(size) > 2.0 * deviation else 0.0)
 
-    def score(self, changed: Callable[[ExperimentRecord], Reals]) -> tuple[float, float]:
+    def score(
+        self, changed: Callable[[ExperimentRecord], Reals], before: tuple[Reals, ...] = ()
+    ) -> tuple[float, float]:
         """The size of an alternative, as a fraction of the plant's gain, and its standard deviation.
 
         changed: the further input of the alternative, MV units, shape (N,), from the record; the size multiplies it.
+        before: this input before each piece of several, as `ExperimentRecord.u_earlier`; without it there was none.
         """
         fit, found = self._fit, self._found
         structure, inputs = found.structure, found.structure.inputs
         moved = changed(fit.record)
         if not np.any(moved):  # MV was never above rest, or the record ends before the delay
             return 0.0, math.inf
-        further = Fit(replace(fit.record, u=moved))
+        further = Fit(replace(fit.record, u=moved, u_earlier=before))
         # a record's input range is its own: the scale of MV must stay that of the fit
         scale = further.record.input_range / fit.record.input_range
         columns = further.regressors(structure, UNDISTURBED, found.theta[None, : structure.searched])[0]
         return self._regression(scale * (columns[:, :inputs] @ found.linear.coefficients[:inputs]))
+
+    def later_since(self, piece: int) -> tuple[float, float]:
+        """By how much the dead time is longer in this piece of the record and those after it than before, in samples,
+        and its standard deviation."""
+        column = self._to_dead_time.copy()
+        column[: self._fit.rows[piece].start] = 0.0
+        return self._regression(column)
 
     def score_in_pv(self, changed: Callable[[Reals], Reals]) -> tuple[float, float]:
         """The size of an alternative in which the gain changes with PV, as a fraction of the gain, and its standard

@@ -39,7 +39,9 @@ class RecordToFit(Protocol):
     """A record with the scales that the fit needs.
 
     Ts: the sample time, s.
-    u, y: MV and PV as deviations from rest, shape (N,); MV is 0 before the record.
+    u, y: MV and PV as deviations from rest, shape (N,).
+    u_earlier: MV as it was before each piece, as a deviation from the same rest, MV units, one array a piece; without
+    them MV was 0.
     input_range, output_range: the scales of MV and PV, MV units and PV units.
     period: the time scale, in samples: about the period of an oscillation at the limit of stability.
     max_dead_time: the longest dead time, in samples.
@@ -54,6 +56,8 @@ class RecordToFit(Protocol):
     def u(self) -> Reals: ...
     @property
     def y(self) -> Reals: ...
+    @property
+    def u_earlier(self) -> Sequence[Reals]: ...
     @property
     def input_range(self) -> float: ...
     @property
@@ -135,6 +139,11 @@ class Fit(Generic[S]):
         kept, self.pieces = _whole_blocks(record.pieces, self.block)
         self.rows = [slice(piece.start // self.block, piece.stop // self.block) for piece in self.pieces]
         self.u = record.u[kept] / record.input_range
+        before = record.u_earlier or [np.empty(0)] * len(self.pieces)
+        self._driving = [
+            (np.append(each / record.input_range, self.u[piece]), len(each))
+            for each, piece in zip(before, self.pieces, strict=True)
+        ]
         self.y = averaged(record.y[kept] / record.output_range, self.block)
         self.samples = len(self.y)
         self.period = record.period
@@ -174,8 +183,8 @@ class Fit(Generic[S]):
         always = (self._level, self._slope)[: 1 + hypothesis.drift]
         width = self.first_load(structure, hypothesis) + order * (loads + free * len(self.pieces))
         out = np.zeros((many, self.samples, width))
-        for rows, piece in zip(self.rows, self.pieces, strict=True):
-            out[:, rows, :inputs] = averaged(driven.drive(self.u[piece], inputs), self.block, 1)
+        for rows, (u, earlier) in zip(self.rows, self._driving, strict=True):
+            out[:, rows, :inputs] = averaged(driven.drive(u, inputs)[:, earlier:], self.block, 1)
         if structure.feed_through:
             out[:, :, inputs] = averaged(self._delayed(driven.delay), self.block, 1)
         at = structure.inputs
@@ -209,13 +218,13 @@ class Fit(Generic[S]):
         return [each for each in found if each.rows.stop - each.rows.start > len(each.columns)]
 
     def _delayed(self, delay: NDArray[np.int64]) -> Reals:
-        """MV a sample and the whole samples of the dead time later, shape (plants, N); 0 before each piece."""
+        """MV a sample and the whole samples of the dead time later, shape (plants, N)."""
         delayed = np.zeros((len(delay), len(self.u)))
-        for piece in self.pieces:
-            length = piece.stop - piece.start
-            for row, late in zip(delayed, delay, strict=True):
-                if late + 1 < length:
-                    row[piece.start + late + 1 : piece.stop] = self.u[piece.start : piece.stop - late - 1]
+        for piece, (u, earlier) in zip(self.pieces, self._driving, strict=True):
+            for row, late in zip(delayed, delay.tolist(), strict=True):
+                if late + 1 < len(u):
+                    moved = np.append(np.zeros(late + 1), u[: len(u) - late - 1])
+                    row[piece] = moved[earlier:]
         return delayed
 
     def _end_with_piece(self, responses: Reals, times: Reals) -> None:

@@ -68,6 +68,11 @@ class ScaledRecord:
         """The record is one piece."""
         return (len(self.y),)
 
+    @property
+    def u_earlier(self) -> tuple[Reals, ...]:
+        """MV was 0 before the record."""
+        return ()
+
 
 class IdentificationProblem:
     """The identification problem of one record: its fits, their residuals and their meaning.

@@ -72,6 +72,34 @@ class SetpointChange:
         return float(np.max(np.abs(sp[self.move : self.end] - sp[self.move - 1])))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class HistoryPart:
+    """A part of a stretch, as deviations from a value at rest.
+
+    stretch: the stretch that it belongs to.
+    samples: the samples of the part within the stretch.
+    before: those of them before anything moves.
+    """
+
+    stretch: Stretch
+    samples: slice
+    before: slice
+
+    def deviations(self, column: Reals) -> Reals:
+        """This part of a column of the stretch, less its value before anything moves."""
+        return np.asarray(column[self.samples] - self._rest(column))
+
+    def deviations_before(self, column: Reals, length: int) -> Reals:
+        """The deviations of the samples before this part, so many at most."""
+        first = self.samples.start
+        return np.asarray(column[max(first - length, 0) : first] - self._rest(column))
+
+    def _rest(self, column: Reals) -> float:
+        """The value before anything moves, one of those of the column: the deviations keep their resolution."""
+        rest = np.sort(column[self.before])
+        return float(rest[len(rest) // 2])
+
+
 def require_operator(stretches: list[Stretch]) -> None:
     """Raises Refused, SETPOINT_IS_DRIVEN, where the set-point moves at so many samples that it is not an operator's."""
     moves, samples = sum(len(each.moves) for each in stretches), sum(len(each.sp) for each in stretches)

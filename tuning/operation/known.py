@@ -16,6 +16,8 @@ def known_plant(found: Observation, sample_time_s: float, age_s: float) -> Obser
     """
     if found.reason is not None or found.evaluation is None:
         return NothingKnown(found.detail)
+    if found.valve is not None:
+        return NothingKnown(f"the plant is known behind {found.valve.in_words}, and a trial moves MV in front of it")
     evaluation, used = found.evaluation, found.used
     record = evaluation.fit.record
     return ObservedPlant(

@@ -8,6 +8,7 @@ the latter: P. Van den Hof, R. Schrama, Automatica 29, 1993.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -18,14 +19,16 @@ from loopwright.tuning.experiments.control_record import ControlPiece, ControlRe
 from loopwright.tuning.fast.controller_effect import with_controller
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation, evaluate
-from loopwright.tuning.fast.record import MIN_LISTENED, Excitation, ExperimentRecord, noise_of
+from loopwright.tuning.fast.record import LONGEST_DEAD_TIME, MIN_LISTENED, Excitation, ExperimentRecord, noise_of
 from loopwright.tuning.fast.record_evaluation import PERIOD_IS_RIGHT, first_period
 from loopwright.tuning.fast.robustness import KnownMs, known_Ms
 from loopwright.tuning.fast.score_tests import STANDARD_DEVIATIONS, ScoreTests, since
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import Reals
+from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN
 from loopwright.tuning.operation.consistency import consistent
+from loopwright.tuning.operation.faulty_valve import FaultyValve, likeliest_fault
 from loopwright.tuning.operation.history import (
+    HistoryPart,
     SetpointChange,
     Stretch,
     parts_at_rest,
@@ -49,6 +52,9 @@ the latest ones."""
 MIN_GAIN_CHANGE = 0.1
 """Smallest part by which the plant's gain must differ from one set-point change on for the earlier ones to be of an
 older plant."""
+MIN_LATER, LATER_DEVIATIONS = 0.03, 3.0
+"""Smallest part of an ultimate period, and smallest number of standard deviations, by which the dead time must be
+longer or shorter from one set-point change on. To leave earlier ones out by chance costs a few changes only."""
 MIN_RESIDUAL = 0.7
 """Smallest residual of the model, in standard deviations of the noise at rest. A smaller one shows that the loop was
 not at rest there, and that the residual was compared with more than the noise."""
@@ -69,6 +75,7 @@ class Observation:
     used: the changes that belong to one plant.
     dropped: further changes, which do not fit these.
     models: what else the record leaves possible, None where that was not looked at.
+    valve: the fault of the valve that explains the record better; the model is then from the valve's position to PV.
     """
 
     reason: Reason | None
@@ -77,6 +84,7 @@ class Observation:
     used: tuple[SetpointChange, ...] = ()
     dropped: tuple[SetpointChange, ...] = ()
     models: PlausibleModels | None = None
+    valve: FaultyValve | None = None
 
     @property
     def known_to(self) -> float | None:
@@ -161,8 +169,7 @@ def _at(period: float, stretches: Sequence[Stretch], reverse: bool, spec: Design
     if rest is None:
         text = f"the loop has not rested for {REST_PERIODS[-1]:g} ultimate periods with its set-point unmoved"
         return Observation(Reason.UNCERTAIN, text)
-    stretch, part = rest
-    noise = noise_of(stretch.pv[part])
+    noise = noise_of(rest.stretch.pv[rest.samples])
     changes = [each for s in stretches for each in setpoint_changes(s, before, after, MIN_SIZE * noise)]
     if not changes:
         text = f"no set-point change of {MIN_SIZE * noise:.3g} or more, followed for {AFTER:g} ultimate periods"
@@ -188,39 +195,42 @@ def _at(period: float, stretches: Sequence[Stretch], reverse: bool, spec: Design
     if reason is None and len(used) < MIN_CHANGES:
         reason, detail = Reason.UNCERTAIN, "one set-point change alone cannot be checked by another; wait for the next"
     found = Observation(reason, detail, evaluation, tuple(used), dropped)
-    return found if found.reason is not None else _checked(found, spec)
+    return found if found.reason is not None else _checked(found, _parts(rest, used), spec)
 
 
 def _of_an_older_plant(evaluation: Evaluation, changes: int) -> int:
-    """How many of the set-point changes, the oldest ones, are of a plant of another gain; 0 where none are."""
-    tests = ScoreTests(evaluation.fit, evaluation.chosen.best)
+    """How many of the set-point changes, the oldest ones, are of a plant of another gain or dead time; 0 where none
+    are."""
+    tests, earlier = ScoreTests(evaluation.fit, evaluation.chosen.best), evaluation.fit.record.u_earlier
     shown = []
-    for older in range(1, changes):
-        size, deviation = tests.score(since(1 + older))  # the first piece is the rest
+    for older in range(1, changes):  # the first piece is the rest
+        before = tuple(u if piece > older else np.zeros(len(u)) for piece, u in enumerate(earlier))
+        size, deviation = tests.score(since(1 + older), before)
         if abs(size) > max(MIN_GAIN_CHANGE, STANDARD_DEVIATIONS * deviation):
             shown.append((abs(size) / deviation, older))
+        later, deviation = tests.later_since(1 + older)
+        if abs(later) > max(MIN_LATER * evaluation.fit.period, LATER_DEVIATIONS * deviation):
+            shown.append((abs(later) / deviation, older))
     return max(shown, default=(0.0, 0))[1]
 
 
-def _rest(stretches: Sequence[Stretch], length: int, after: int) -> tuple[Stretch, slice] | None:
+def _rest(stretches: Sequence[Stretch], length: int, after: int) -> HistoryPart | None:
     """The quiet part whose noise is at the quantile of all quiet parts."""
-    parts = [(noise_of(each.pv[part]), each, part) for each in stretches for part in parts_at_rest(each, length, after)]
-    if not parts:
-        return None
-    parts.sort(key=lambda each: each[0])
-    _, stretch, part = parts[int(REST_QUANTILE * (len(parts) - 1))]
-    return stretch, part
+    parts = [HistoryPart(each, part, part) for each in stretches for part in parts_at_rest(each, length, after)]
+    parts.sort(key=lambda each: noise_of(each.stretch.pv[each.samples]))
+    return parts[int(REST_QUANTILE * (len(parts) - 1))] if parts else None
 
 
-def _record(
-    rest: tuple[Stretch, slice], changes: Sequence[SetpointChange], reverse: bool, period: float
-) -> ExperimentRecord:
+def _parts(rest: HistoryPart, changes: Sequence[SetpointChange]) -> list[HistoryPart]:
+    return [rest, *(HistoryPart(each.stretch, each.samples, slice(each.first, each.move)) for each in changes)]
+
+
+def _record(rest: HistoryPart, changes: Sequence[SetpointChange], reverse: bool, period: float) -> ExperimentRecord:
     """The rest and the changes as one record of several pieces. Raises Refused as `ExperimentRecord`."""
-    stretch, part = rest
-    pieces = [(stretch, part, part), *((each.stretch, each.samples, slice(each.first, each.move)) for each in changes)]
-    u = [_deviation(s.mv, at, before) for s, at, before in pieces]
-    y = [_deviation(s.pv, at, before) for s, at, before in pieces]
-    lengths = tuple(map(len, u))
+    stretch, parts = rest.stretch, _parts(rest, changes)
+    u = [each.deviations(each.stretch.mv) for each in parts]
+    y = [each.deviations(each.stretch.pv) for each in parts]
+    lengths, longest = tuple(map(len, u)), math.ceil(LONGEST_DEAD_TIME * period) + 1
     return ExperimentRecord(
         Ts=stretch.Ts,
         u=np.concatenate(u),
@@ -232,31 +242,26 @@ def _record(
         period=period,
         excitation=Excitation.OBSERVE,
         lengths=lengths,
+        u_earlier=tuple(each.deviations_before(each.stretch.mv, longest) for each in parts),
         held_s=stretch.held_s,
-        control=_control(pieces, stretch.Ts, reverse) if stretch.held_s is None else None,
+        control=_control(parts, stretch.Ts, reverse) if stretch.held_s is None else None,
     )
 
 
-def _control(pieces: Sequence[tuple[Stretch, slice, slice]], Ts: float, reverse: bool) -> ControlRecord:
-    """What the samples of the pieces show of the controller; means of several samples would not tell."""
+def _control(parts: Sequence[HistoryPart], Ts: float, reverse: bool) -> ControlRecord:
+    """What the samples of the parts show of the controller; means of several samples would not tell."""
     return ControlRecord(
         Ts,
         reverse,
         tuple(
-            ControlPiece(stretch.gains, stretch.sp[at][part], stretch.pv[at][part], stretch.mv[at][part])
-            for stretch, at, _ in pieces
-            for part in rows_without_limit(stretch.mv[at])
+            ControlPiece(s.gains, s.sp[at][rows], s.pv[at][rows], s.mv[at][rows])
+            for s, at in ((each.stretch, each.samples) for each in parts)
+            for rows in rows_without_limit(s.mv[at])
         ),
     )
 
 
-def _deviation(column: Reals, at: slice, before: slice) -> Reals:
-    """A part of a column as deviations from a value at rest; the values keep their resolution."""
-    rest = np.sort(column[before])
-    return np.asarray(column[at] - rest[len(rest) // 2])
-
-
-def _checked(found: Observation, spec: DesignSpec) -> Observation:
+def _checked(found: Observation, parts: Sequence[HistoryPart], spec: DesignSpec) -> Observation:
     """The observation, without gains where a check of the whole speaks against them."""
     evaluation, changes = found.evaluation, found.used
     assert evaluation is not None
@@ -264,12 +269,15 @@ def _checked(found: Observation, spec: DesignSpec) -> Observation:
         text = f"the model leaves {evaluation.residual:.2g} of what moved PV where the loop seemed to rest"
         detail = f"{text}: something else moved PV there, and the noise is not known"
         return replace(found, reason=Reason.UNCERTAIN, detail=detail)
-    gains, limit = evaluation.best.gains, MAX_UNCERTAINTY[Excitation.OBSERVE]
+    limit = MAX_UNCERTAINTY[Excitation.OBSERVE]
     models = plausible_models(evaluation)
-    doubt = models.doubt(gains)
-    if doubt is not None and doubt.whole <= limit:
-        models = models.with_valve()
-        doubt = models.doubt(gains)
+    doubt = models.doubt(evaluation.best.gains)
+    if found.valve is None and doubt is not None and doubt.whole <= limit:
+        likeliest = likeliest_fault(evaluation.fit, evaluation.chosen.best, parts)
+        if likeliest is not None and (with_valve := _with_valve(found, likeliest, spec)) is not None:
+            return with_valve if with_valve.reason is not None else _checked(with_valve, parts, spec)
+        models = models.with_valve(parts, likeliest)
+        doubt = models.doubt(evaluation.best.gains)
     found = replace(found, models=models)
     if doubt is None or doubt.whole > limit:
         return replace(found, reason=Reason.UNCERTAIN, detail=_in_words(doubt, len(changes)))
@@ -278,6 +286,19 @@ def _checked(found: Observation, spec: DesignSpec) -> Observation:
         detail = f"what the set-point alone moved gives Ms {alone:.2f} instead of {evaluation.Ms:.2f}"
         return replace(found, reason=Reason.DISTURBED, detail=detail)
     return found
+
+
+def _with_valve(found: Observation, valve: FaultyValve, spec: DesignSpec) -> Observation | None:
+    """The observation with the position of this valve in place of MV, None where that does not explain the record
+    better."""
+    assert found.evaluation is not None
+    if not valve.clear:
+        return None
+    fit = found.evaluation.fit
+    evaluation = with_controller(evaluate(replace(fit.record, u=valve.u, u_earlier=valve.u_earlier), spec))
+    if evaluation.chosen.best.bic > found.evaluation.chosen.best.bic - MIN_BIC_GAIN:
+        return None
+    return replace(found, reason=evaluation.reason, detail=evaluation.detail, evaluation=evaluation, valve=valve)
 
 
 def _in_words(doubt: Doubt | None, changes: int) -> str:

@@ -16,10 +16,11 @@ from loopwright.tuning.fast.evaluation import Evaluation
 from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.fast.robustness import KnownMs, known_Ms
 from loopwright.tuning.fast.uncertainty import filter_ratio, peak, uncertainty_of_Ms
-from loopwright.tuning.fast.valve_faults import models_of_small_faults
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.models import TransferFunction
+from loopwright.tuning.operation.faulty_valve import FaultyValve, models_of_small_faults
+from loopwright.tuning.operation.history import HistoryPart
 
 OTHER_BIC = 20.0
 """Difference of BIC within which Ms on another structure counts. Two parameters more cost more than RIVAL_BIC where
@@ -56,9 +57,12 @@ class PlausibleModels:
     left_out: tuple[TransferFunction, ...]
     valve: tuple[TransferFunction, ...] = ()
 
-    def with_valve(self) -> PlausibleModels:
-        """These with the models of a valve that moves a little less than MV."""
-        found = models_of_small_faults(self.evaluation.fit, self.evaluation.chosen.best)
+    def with_valve(self, parts: Sequence[HistoryPart], likeliest: FaultyValve | None) -> PlausibleModels:
+        """These with the models of a valve that moves a little less than MV.
+
+        parts: those of the record. likeliest: the fault that the record speaks for most.
+        """
+        found = models_of_small_faults(self.evaluation.fit, self.evaluation.chosen.best, parts, likeliest)
         return replace(self, valve=tuple(found))
 
     def doubt(self, gains: Gains) -> Doubt | None:
@@ -96,7 +100,9 @@ def _model_without(fit: Fit[ExperimentRecord], found: Fitted, piece: int) -> Tra
     end = int(np.sum(record.lengths[: piece + 1]))
     left = np.delete(np.arange(len(record.u)), slice(end - record.lengths[piece], end))
     lengths = record.lengths[:piece] + record.lengths[piece + 1 :]
-    fewer = Fit(replace(record, u=record.u[left], y=record.y[left], excited=len(left), lengths=lengths))
+    before = record.u_earlier[:piece] + record.u_earlier[piece + 1 :]
+    shorter = replace(record, u=record.u[left], y=record.y[left], excited=len(left), lengths=lengths, u_earlier=before)
+    fewer = Fit(shorter)
     times, out = found.theta[structure.searched :], fit.pieces[piece]
     times = times[(times < out.start) | (times >= out.stop)]
     times = np.where(times >= out.stop, times - (out.stop - out.start), times)

@@ -40,7 +40,7 @@ def Ms_by_setpoint_alone(evaluation: Evaluation, changes: Sequence[SetpointChang
     for change, length in zip(changes, record.lengths[1:], strict=True):
         u[at : at + length] = mv_of_setpoint(delayed(evaluation.model, evaluation.design_delay), change)
         at += length
-    instruments = Fit(replace(record, u=u))
+    instruments = Fit(replace(record, u=u, u_earlier=()))
     moved = _moved_by(instruments, best)
     slopes = unknown_columns(fit, best)
     kept = np.concatenate((np.arange(structure.searched), len(best.theta) + np.arange(structure.inputs)))

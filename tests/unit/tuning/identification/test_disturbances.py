@@ -27,6 +27,7 @@ class Record:
     output_range: float = 1.0
     period: float = 60.0
     max_dead_time: float = 60.0
+    u_earlier: tuple[Reals, ...] = ()
 
 
 @pytest.mark.parametrize("pieces", [(300,), (120, 180)], ids=["one piece", "two pieces"])

@@ -12,7 +12,7 @@ from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.identification.disturbances import by_bic, fit_structures
 from loopwright.tuning.identification.output_error import UNDISTURBED, DisturbanceHypothesis, Fit
 from loopwright.tuning.identification.projection import Projection
-from loopwright.tuning.identification.structures import FIRST, SECOND
+from loopwright.tuning.identification.structures import FIRST, SECOND, SECOND_WITH_FEED_THROUGH, Structure
 from loopwright.tuning.models import Reals
 
 K, T1, T2, DELAY, TS = 2.0, 8.0, 3.0, 6, 0.25
@@ -26,8 +26,11 @@ def of_the_plant(u: Reals, load: Reals) -> Reals:
     return np.asarray(dlsim(system, late)[1][:, 0])
 
 
-def record(load: float = 0.0) -> ExperimentRecord:
-    """Three pieces cut from one simulation, so that none begins at rest; the levels are moved apart."""
+def record(load: float = 0.0, known_before: int = 0) -> ExperimentRecord:
+    """Three pieces cut from one simulation, so that none begins at rest; the levels are moved apart.
+
+    known_before: the number of samples before each piece of which MV is known.
+    """
     random = np.random.default_rng(5)
     u = np.repeat(random.choice((-1.0, 0.0, 1.0), size=60), 25)
     step = np.where(np.arange(len(u)) >= 900, load, 0.0)
@@ -40,6 +43,7 @@ def record(load: float = 0.0) -> ExperimentRecord:
         Ts=TS, u=np.concatenate([u[piece] for piece in cut]), y=np.concatenate(y_of), direction=1.0,
         listened=LENGTHS[0], excited=sum(LENGTHS), turns=2, period=60.0,
         excitation=Excitation.OBSERVE, lengths=LENGTHS,
+        u_earlier=tuple(u[piece.start - known_before : piece.start] for piece in cut) if known_before else (),
     )  # fmt: skip
 
 
@@ -52,6 +56,19 @@ def test_the_plant_is_found_from_pieces_that_do_not_begin_at_rest() -> None:
     assert model.static_gain == pytest.approx(K, rel=0.02)
     assert sorted(-1.0 / np.roots(model.den).real) == pytest.approx([T2, T1], rel=0.05)
     assert pytest.approx(DELAY * TS, abs=0.5 * TS) == model.L
+
+
+@pytest.mark.parametrize("structure", [SECOND, SECOND_WITH_FEED_THROUGH], ids=lambda each: each.name)
+def test_mv_before_each_piece_gives_the_plant_exactly(structure: Structure) -> None:
+    fit = Fit(record(known_before=DELAY + 1))
+    start = np.array([np.log(1.1 * (1.0 / T1 + 1.0 / T2)), np.log(0.9 / (T1 * T2)), DELAY + 0.4])
+    best = fit.search(structure, UNDISTURBED, [start])
+    model = fit.model(best)
+    assert best.rms < 1e-6
+    assert model.static_gain == pytest.approx(K, rel=1e-4)
+    assert sorted(-1.0 / np.roots(model.den).real) == pytest.approx([T2, T1], rel=1e-3)
+    # a zero and a feed-through stand for a part of the dead time between samples
+    assert structure is not SECOND or pytest.approx(DELAY * TS, abs=1e-3 * TS) == model.L
 
 
 def test_each_piece_keeps_whole_blocks() -> None:

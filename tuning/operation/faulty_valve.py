@@ -1,0 +1,142 @@
+"""A faulty valve in normal operation: the fault that the record shows, and those that it does not exclude.
+
+The valve is followed through the whole of each stretch, not from the start of each part of the record: where it stands
+as a part begins depends on how MV moved before.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.score_tests import STANDARD_DEVIATIONS, ScoreTests
+from loopwright.tuning.fast.valve_faults import FAULTS, Fault, backlash, stiction
+from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN
+from loopwright.tuning.identification.output_error import Fit, Fitted
+from loopwright.tuning.models import Reals, TransferFunction
+from loopwright.tuning.operation.history import HistoryPart
+
+SMALLEST, LARGEST = 0.005, 0.1
+"""Sizes of a fault that are tried, as fractions of the largest deviation of MV."""
+RATIO, RATIO_OF_BACKLASH = 1.01, 1.05
+"""Ratios of the sizes that are tried: when a valve that sticks jumps tells its stiction sharply."""
+BEST, FINER = 8, 10
+"""How many of these sizes are tried again with their neighbours, and the number of those on either side."""
+TOGETHER = 50
+"""Number of sizes for which a valve is followed at once, which bounds the memory."""
+SMALL = (0.01, 0.02, 0.03)
+"""Sizes of a fault, as fractions of the largest deviation of MV, that a sound valve may have. They change Ms where MV
+moves little."""
+STEPS = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaultyValve:
+    """A valve with a fault.
+
+    size: the size of the fault, in MV units.
+    gain: by how much chi-squared of the residual would be smaller with the fault, by its score test.
+    u, u_earlier: the position of the valve in the record and before each piece, as `ExperimentRecord`.
+    """
+
+    fault: Fault
+    size: float
+    gain: float
+    u: Reals
+    u_earlier: tuple[Reals, ...]
+
+    @property
+    def clear(self) -> bool:
+        """Whether the score test is beyond chance."""
+        return self.gain > STANDARD_DEVIATIONS**2
+
+    @property
+    def in_words(self) -> str:
+        """The fault with its size."""
+        return FAULTS[self.fault][1].format(self.size)
+
+
+def likeliest_fault(fit: Fit[ExperimentRecord], best: Fitted, parts: Sequence[HistoryPart]) -> FaultyValve | None:
+    """The fault whose score test speaks for it most clearly, None where none does.
+
+    parts: those of the record, in its order.
+    """
+    tests, record = ScoreTests(fit, best), fit.record
+
+    def tried(fault: Fault, sizes: Reals) -> list[FaultyValve]:
+        return [scored(fault, *each) for each in _positions(record, parts, fault, sizes)]
+
+    def scored(fault: Fault, size: float, u: Reals, u_earlier: tuple[Reals, ...]) -> FaultyValve:
+        before = tuple(each - mv for each, mv in zip(u_earlier, record.u_earlier, strict=True))
+        share, deviation = tests.score(lambda record: np.asarray(u - record.u), before)
+        return FaultyValve(fault, size, (2.0 * share - 1.0) / deviation**2, u, u_earlier)
+
+    found: list[FaultyValve] = []
+    for fault, ratio in ((backlash, RATIO_OF_BACKLASH), (stiction, RATIO)):
+        count = math.ceil(math.log(LARGEST / SMALLEST, ratio))
+        found += tried(fault, np.asarray(record.input_range * SMALLEST * ratio ** np.arange(count)))
+    near = RATIO ** (np.arange(-FINER, FINER + 1) / FINER)
+    for each in heapq.nlargest(BEST, found, key=_gain):
+        found += tried(each.fault, np.asarray(each.size * near))
+    likeliest = max(found, key=_gain)
+    return likeliest if likeliest.gain > 0.0 else None
+
+
+def _gain(valve: FaultyValve) -> float:
+    return valve.gain
+
+
+def models_of_small_faults(
+    fit: Fit[ExperimentRecord], best: Fitted, parts: Sequence[HistoryPart], likeliest: FaultyValve | None
+) -> Iterator[TransferFunction]:
+    """The models of the plant where the valve moves a little less than MV and the record does not exclude that.
+
+    A valve that follows or sticks by a few hundredths of MV's largest deviation leaves hardly a trace in a record that
+    moves MV little, and makes the plant seem weaker than it is. It is excluded where it raises BIC by MIN_BIC_GAIN, as
+    much as it would have to lower BIC to be believed.
+    """
+    for fault in (backlash, stiction):
+        theta = best.theta
+        sizes = fit.record.input_range * np.array(SMALL)
+        inputs = [each[1:] for each in _positions(fit.record, parts, fault, sizes)]
+        if likeliest is not None and likeliest.fault is fault:
+            inputs.append((likeliest.u, likeliest.u_earlier))
+        for u, u_earlier in inputs:
+            moved = Fit(replace(fit.record, u=u, u_earlier=u_earlier))
+            found = moved.search(best.structure, best.hypothesis, [theta], STEPS)
+            theta = found.theta
+            if found.bic < best.bic + MIN_BIC_GAIN:
+                yield moved.model(found)
+
+
+def _positions(
+    record: ExperimentRecord, parts: Sequence[HistoryPart], fault: Fault, sizes: Reals
+) -> Iterator[tuple[float, Reals, tuple[Reals, ...]]]:
+    """Each size with the positions of such a valve in these parts of the record, and before each part; a stretch
+    begins with the valve where MV is."""
+    stretches = {id(each.stretch): each.stretch for each in parts}
+    lengths = [*map(len, record.u_earlier)]
+    for some in np.split(sizes, range(TOGETHER, len(sizes), TOGETHER)):
+        followed = {at: followed_by(fault, each.mv - each.mv[0], some) for at, each in stretches.items()}
+        for i, size in enumerate(some.tolist()):
+            of = [(each, followed[id(each.stretch)][i]) for each in parts]
+            u = np.concatenate([each.deviations(position) for each, position in of])
+            yield size, u, tuple(each.deviations_before(at, n) for (each, at), n in zip(of, lengths, strict=True))
+
+
+def followed_by(fault: Fault, u: Reals, sizes: Reals) -> Reals:
+    """The positions of a valve with each of these sizes of stiction or backlash, shape (sizes, N); u: MV, shape
+    (N,)."""
+    at, found = np.zeros(len(sizes)), np.empty((len(u), len(sizes)))
+    for k, value in enumerate(u.tolist()):  # many sizes at once: much faster than one after the other
+        if fault is stiction:
+            at = np.where(np.abs(value - at) > sizes, value, at)
+        else:
+            at = np.minimum(np.maximum(at, value - sizes), value + sizes)
+        found[k] = at
+    return np.ascontiguousarray(found.T)
