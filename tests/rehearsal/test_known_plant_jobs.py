@@ -35,7 +35,7 @@ LOOPS = parse_site({"loops": [entry(TAG) | {"test": {"excitations": ["observe", 
 @cache
 def shown(plant: FOPDT) -> ObservedPlant:
     """What operation has shown of a plant, around MV 50."""
-    sp = np.repeat([0.0, 1.6, -0.6, 1.2, 0.0], round(120.0 / TS))
+    sp = np.repeat([0.0, 1.6, -0.6, 1.2, 0.0, 1.4, 0.2], round(120.0 / TS))
     known = known_plant(observe([operated(plant, Gains(0.2, 6.0), sp, Ts=TS)], True, ASKED), TS, 60.0)
     assert isinstance(known, ObservedPlant), known
     return replace(known, mv=(known.mv[0] + 50.0, known.mv[1] + 50.0))
@@ -91,7 +91,7 @@ def test_a_job_cut_off_in_its_trial_begins_with_the_same_knowledge(tmp_path: Pat
     assert (first.asked, again.asked) == (1, 0)
     assert ran == ["preflight", "design", "trial", "settle", "preflight", "design", "trial", "redesign"]
     assert row.result is not None and row.result.new_gains is not None
-    assert getattr(row.result, "model_from", "").startswith("4 set-point changes of normal operation")
+    assert getattr(row.result, "model_from", "").startswith("6 set-point changes of normal operation")
     assert row.restored is not None and row.restored["on_trial"] is False
     again.store.close()
 

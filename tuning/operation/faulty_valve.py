@@ -29,9 +29,9 @@ BEST, FINER = 8, 10
 """How many of these sizes are tried again with their neighbours, and the number of those on either side."""
 TOGETHER = 50
 """Number of sizes for which a valve is followed at once, which bounds the memory."""
-SMALL = (0.01, 0.02, 0.03)
+SMALL = {backlash: (0.005, 0.01, 0.015), stiction: (0.01, 0.02, 0.03)}
 """Sizes of a fault, as fractions of the largest deviation of MV, that a sound valve may have. They change Ms where MV
-moves little."""
+moves little. A valve with backlash stands still for twice its size when MV turns."""
 STEPS = 10
 
 
@@ -100,10 +100,9 @@ def models_of_small_faults(
     moves MV little, and makes the plant seem weaker than it is. It is excluded where it raises BIC by MIN_BIC_GAIN, as
     much as it would have to lower BIC to be believed.
     """
-    for fault in (backlash, stiction):
+    for fault, sizes in SMALL.items():
         theta = best.theta
-        sizes = fit.record.input_range * np.array(SMALL)
-        inputs = [each[1:] for each in _positions(fit.record, parts, fault, sizes)]
+        inputs = [each[1:] for each in _positions(fit.record, parts, fault, fit.record.input_range * np.array(sizes))]
         if likeliest is not None and likeliest.fault is fault:
             inputs.append((likeliest.u, likeliest.u_earlier))
         for u, u_earlier in inputs:
