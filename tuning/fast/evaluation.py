@@ -37,8 +37,9 @@ the earlier model; the second value holds where the model has two load disturban
 LOAD_WINDOW = (0.15, 0.8)
 """Periods before and after the set-point step within which a load disturbance counts as coming with the step."""
 LATE_LOAD, SAME_LOAD = 0.5, 0.3
-"""Times in periods. A load disturbance at most LATE_LOAD before the step need not have shown in the relay's record; if
-it has not, it may really be a change of the plant. Two load disturbances closer than SAME_LOAD are the same one."""
+"""Times in periods. A load disturbance at most LATE_LOAD before the step need not have shown in the record without the
+step; if it has not, it may really be a change of the plant. Two load disturbances closer than SAME_LOAD are the same
+one."""
 MAX_GAIN_CHANGE = 1.5
 """Largest accepted ratio of new to tested Kp or Ti where a load disturbance seems to have come with the tested
 gains."""
@@ -234,24 +235,25 @@ def _load_with_the_step(
     A load disturbance found together with the new gains may really be a change of the plant, so it is accepted only if
     the step back is explained without another one and the gains designed on the whole record are close to those tested.
     The second condition is needed because relay and steps excite different frequencies: one model can fit the plant
-    before the change at the former and the plant after the change at the latter. A load disturbance in mid-relay that
-    the relay's own record had not shown is treated in the same way.
+    before the change at the former and the plant after the change at the latter. A load disturbance before the step is
+    treated in the same way where the record without the step had not shown it.
     """
     steps, period = fit.record.steps, fit.period
     if not steps:
         return None, ""
     times, shown = _loads(found), _loads(earlier.chosen.best)
     new = [at for at in times if all(abs(at - each) > SAME_LOAD * period for each in shown)]
+    before_step = fit.record.excitation.record
     if any(at < steps[0] - LATE_LOAD * period for at in new):
         if len(steps) == 1:
             return (
                 Reason.AMBIGUOUS,
-                "the whole record shows a load disturbance in mid-relay that the relay's own record did not show",
+                f"the whole record shows a load disturbance before the step that {before_step} did not show",
             )
         if len(times) > 1:
             return (
                 Reason.MODEL_MISMATCH,
-                "the whole record shows other load disturbances in mid-relay than the relay's own record",
+                f"the whole record shows other load disturbances before the step than {before_step}",
             )
     before, after = LOAD_WINDOW
     loads = [at for at in times if at > steps[0] - (LATE_LOAD if at in new else before) * period]
@@ -280,7 +282,7 @@ def _loads(found: Fitted) -> list[float]:
 def _model_mismatch(
     earlier: Evaluation, model: TransferFunction, best: OptimalGains, design: GainDesign, loads: int
 ) -> tuple[Reason | None, str]:
-    """The reason and the detail where the relay's model and that of the whole record disagree on a controller.
+    """The reason and the detail where the model without the step and that of the whole record disagree on a controller.
 
     Both models must give both controllers about the Ms that each was designed for. Otherwise a disturbance, or a change
     of the plant, has entered one of the models.
@@ -293,6 +295,7 @@ def _model_mismatch(
         text = f"the controller that was tested has Ms {tested:.2f} on the model of the whole record, not {asked}"
         return Reason.MODEL_MISMATCH, text
     if abs(again - best.Ms) > maximum:
-        text = f"the controller designed on the whole record has Ms {again:.2f} on the relay's model, not {best.Ms:.4g}"
+        before_step = f"the model of {earlier.fit.record.excitation.record}"
+        text = f"the controller designed on the whole record has Ms {again:.2f} on {before_step}, not {best.Ms:.4g}"
         return Reason.MODEL_MISMATCH, text
     return None, ""

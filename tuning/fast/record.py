@@ -33,6 +33,13 @@ class Excitation(StrEnum):
             "manual": "pulses of the manual output",
         }[self]
 
+    @property
+    def record(self) -> str:
+        """The record of this excitation, before any step under new gains, in the words of a sentence."""
+        if self is Excitation.OBSERVE:
+            return "the record of normal operation"
+        return "the relay's record" if self is Excitation.RELAY else "the pulses' record"
+
 
 MIN_LISTENED = 60
 """Smallest number of averages of the time at rest, from which noise and offset are estimated."""

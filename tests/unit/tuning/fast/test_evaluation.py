@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.evaluation import evaluate
-from loopwright.tuning.fast.record import oscillation_period
+from loopwright.tuning.fast.record import Excitation, oscillation_period
 from loopwright.tuning.fast.uncertainty import peak, seen_covariance
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
@@ -75,6 +75,19 @@ def test_gains_that_came_of_another_plant_are_a_surprise() -> None:
     found = evaluate(evidence, DesignSpec(1.6), replace(other, best=stronger))
     assert found.reason == Reason.MODEL_MISMATCH
     assert f"{peak(found.model, stronger.gains, np.geomspace(1e-3, 30.0, 4000), 0.05):.2f}" in found.detail
+
+
+@pytest.mark.parametrize(
+    ("excitation", "said"), [(Excitation.RELAY, "the relay's record"), (Excitation.SETPOINT, "the pulses' record")]
+)
+def test_a_refusal_names_the_record_of_the_excitation_that_was_there(excitation: Excitation, said: str) -> None:
+    evidence = replace(record(FIRST, 0.01 * record(FIRST).output_range), excitation=excitation)
+    other = evaluate(evidence, DesignSpec(1.6))
+    model = other.model
+    stronger = replace(model, num=tuple(1.8 * each for each in model.num))
+    found = evaluate(evidence, DesignSpec(1.6), replace(other, model=stronger))
+    assert found.reason is Reason.MODEL_MISMATCH
+    assert f"on the model of {said}, not 1.6" in found.detail
 
 
 def test_too_few_switches_or_too_short_a_rest_are_no_evidence() -> None:
