@@ -10,6 +10,7 @@ import heapq
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 
@@ -23,8 +24,8 @@ from loopwright.tuning.operation.history import HistoryPart
 
 SMALLEST, LARGEST = 0.005, 0.1
 """Sizes of a fault that are tried, as fractions of the largest deviation of MV."""
-RATIO, RATIO_OF_BACKLASH = 1.01, 1.05
-"""Ratios of the sizes that are tried: when a valve that sticks jumps tells its stiction sharply."""
+RATIOS: dict[Fault, float] = {backlash: 1.05, stiction: 1.01}
+"""Ratio of each size to the one before: when a valve that sticks jumps tells its stiction sharply."""
 BEST, FINER = 8, 10
 """How many of these sizes are tried again with their neighbours, and the number of those on either side."""
 TOGETHER = 50
@@ -68,27 +69,25 @@ def likeliest_fault(fit: Fit[ExperimentRecord], best: Fitted, parts: Sequence[Hi
     """
     tests, record = ScoreTests(fit, best), fit.record
 
-    def tried(fault: Fault, sizes: Reals) -> list[FaultyValve]:
-        return [scored(fault, *each) for each in _positions(record, parts, fault, sizes)]
+    def gains(fault: Fault, sizes: Reals) -> Iterator[tuple[float, Fault, float]]:
+        for size, u, u_earlier in _positions(record, parts, fault, sizes):
+            yield gain(u - record.u, u_earlier), fault, size
 
-    def scored(fault: Fault, size: float, u: Reals, u_earlier: tuple[Reals, ...]) -> FaultyValve:
+    def gain(further: Reals, u_earlier: tuple[Reals, ...]) -> float:
         before = tuple(each - mv for each, mv in zip(u_earlier, record.u_earlier, strict=True))
-        share, deviation = tests.score(lambda record: np.asarray(u - record.u), before)
-        return FaultyValve(fault, size, (2.0 * share - 1.0) / deviation**2, u, u_earlier)
+        share, deviation = tests.score(lambda _: further, before)
+        return (2.0 * share - 1.0) / deviation**2
 
-    found: list[FaultyValve] = []
-    for fault, ratio in ((backlash, RATIO_OF_BACKLASH), (stiction, RATIO)):
+    found: list[tuple[float, Fault, float]] = []
+    for fault, ratio in RATIOS.items():
         count = math.ceil(math.log(LARGEST / SMALLEST, ratio))
-        found += tried(fault, np.asarray(record.input_range * SMALLEST * ratio ** np.arange(count)))
-    near = RATIO ** (np.arange(-FINER, FINER + 1) / FINER)
-    for each in heapq.nlargest(BEST, found, key=_gain):
-        found += tried(each.fault, np.asarray(each.size * near))
-    likeliest = max(found, key=_gain)
-    return likeliest if likeliest.gain > 0.0 else None
-
-
-def _gain(valve: FaultyValve) -> float:
-    return valve.gain
+        found += gains(fault, np.asarray(record.input_range * SMALLEST * ratio ** np.arange(count)))
+    near = RATIOS[stiction] ** (np.arange(-FINER, FINER + 1) / FINER)
+    for _, fault, size in heapq.nlargest(BEST, found, key=itemgetter(0)):
+        found += gains(fault, np.asarray(size * near))
+    most, fault, size = max(found, key=itemgetter(0))
+    _, u, u_earlier = next(_positions(record, parts, fault, np.array([size])))
+    return FaultyValve(fault, size, most, u, u_earlier) if most > 0.0 else None
 
 
 def models_of_small_faults(
