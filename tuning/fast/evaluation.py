@@ -139,6 +139,8 @@ def evaluate(
             reason, detail = _nonlinearity(fit, found) or (None, "")
         if reason is None:
             reason, detail = _load_with_the_step(fit, found, earlier, best.gains)
+        if reason is None:
+            reason, detail = _changed_with_the_gains(fit, found) or (None, "")
     if earlier is not None or not test_follows:
         reason, detail = _instead_of_loads(fit, found, reason, detail)
     if reason is None and _stand_for_a_curve(record, found):
@@ -272,6 +274,17 @@ def _load_with_the_step(
         text = f"{come}, and would ask for {Kp:.2f} times their Kp, {Ti:.2f} Ti"
         return Reason.MODEL_MISMATCH, f"{text}; a plant that has changed would look the same"
     return None, ""
+
+
+def _changed_with_the_gains(fit: Fit[ExperimentRecord], found: Fitted) -> tuple[Reason, str] | None:
+    """The reason and the detail where the record shows another gain of the plant under the new gains. A load
+    disturbance that came with one step would look the same, one that comes with two does not."""
+    if (shown := ScoreTests(fit, found).changed_with_the_gains()) is None:
+        return None
+    what = f"{shown.what}, +-{2.0 * shown.deviation:.2g}"
+    if len(fit.record.steps) == 1:
+        return Reason.AMBIGUOUS, f"{what}; a load disturbance with the step would look the same"
+    return Reason.UNEXPLAINED, what
 
 
 def _loads(found: Fitted) -> list[float]:

@@ -28,6 +28,8 @@ FIRST_DELAY, DELAY_RATIO = 0.4, 1.25
 NOTABLE_LATER = 0.3
 """Size of a second path, a fraction of the plant's effect, that makes Ms about 2 with the gains for Ms 1.6."""
 NEGLIGIBLE_DIRECTION = 1e-9
+MIN_CHANGE = 0.1
+"""Smallest part by which the plant's gain must differ under the new gains to be shown."""
 FAR = 0.5
 """Where PV is far from the operating point, as a part of its way."""
 
@@ -60,6 +62,12 @@ def fading(record: ExperimentRecord) -> Reals:
     """MV times a factor that grows from 0 at the end of the rest to 1 at the end of the record, shape (N,)."""
     grown = np.clip(np.arange(len(record.u)) - record.listened, 0.0, None)
     return np.asarray(record.u * grown / max(float(grown[-1]), 1.0))
+
+
+def since_step(record: ExperimentRecord) -> Reals:
+    """MV from the first step under the new gains on, 0 before, MV units, shape (N,)."""
+    begin = record.steps[0] if record.steps else len(record.u)
+    return np.concatenate((np.zeros(begin), record.u[begin:]))
 
 
 def since(piece: int) -> Callable[[ExperimentRecord], Reals]:
@@ -111,6 +119,14 @@ class ScoreTests:
             if abs(size) > max(each.minimum, STANDARD_DEVIATIONS * deviation):
                 shown.append(Alternative(each.words(size), size, deviation))
         return max(shown, key=lambda each: abs(each.size) / each.deviation, default=None)
+
+    def changed_with_the_gains(self) -> Alternative | None:
+        """A plant whose gain is another one under the new gains, None where the record does not show one."""
+        size, deviation = self.score(since_step)
+        if abs(size) <= max(MIN_CHANGE, STANDARD_DEVIATIONS * deviation):
+            return None
+        text = f"the plant's gain is {max(1.0 + size, 0.0):.2g} times what it was before the new gains took over"
+        return Alternative(text, size, deviation)
 
     def longest_delay_seen(self) -> float:
         """The longest delay, s, up to which the record would show a second path of 30 % of the plant's effect; 0 where

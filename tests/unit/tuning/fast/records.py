@@ -97,18 +97,20 @@ def pulse_record(
     load: float = 0.0,
     periods: float = 3.0,
     load_lasts: float = math.inf,
+    changed: float = 1.0,
 ) -> ExperimentRecord:
     """Pulses of the set-point by 1 up, down and up, turned after 0.7 and 1.7 ultimate periods, over three periods.
 
     below: the plant's gain below rest, as a part of that above.  end: the gain at the end over that at rest.
     share, later: a second path, a part of the first one, ultimate periods later.  load: MV units, 1.3 periods
-    before the end, for so many periods.  periods: the length of the test.
+    before the end, for so many periods.  periods: the length of the test.  changed: the gain from the last turn on,
+    which is the record's step, over that before.
     """
     plant = LinearPlant(bench.num, bench.den, bench.L, bench.Ts, noise_std=noise, seed=seed)
     channel = Channel(bench.Ts, Settings(-50.0, 50.0, 0.0), Parameters(Kp, Ti), 0.0, Mode.AUTOMATIC)
     period = ultimate_point(bench.model)[1] / bench.Ts
     u, y = [], []
-    samples = LISTENED + round(periods * period)
+    samples, step = LISTENED + round(periods * period), LISTENED + math.ceil(1.7 * period)
     for k in range(samples):
         channel.setpoint = 0.0 if k < LISTENED else -1.0 if 0.7 < (k - LISTENED) / period < 1.7 else 1.0
         since = (k - samples) / period + 1.3
@@ -116,6 +118,7 @@ def pulse_record(
         y.append(plant.pv)
         u.append(channel.step(y[-1]))
         gain = 1.0 + (end - 1.0) * max(k - LISTENED, 0) / (samples - LISTENED)
+        gain *= changed if k >= step else 1.0
         moved = u[-1] if u[-1] > 0.0 else below * u[-1]
         before = k - round(later * period)
         plant.step(gain * moved + (share * u[before] if share and before >= 0 else 0.0))
@@ -123,5 +126,5 @@ def pulse_record(
     rest = slice(LISTENED)
     return ExperimentRecord(
         bench.Ts, at - at[rest].mean(), pv - pv[rest].mean(), 1.0, LISTENED, len(u), 2,
-        period, (), Excitation.SETPOINT,
+        period, (step,) if changed != 1.0 else (), Excitation.SETPOINT,
     )  # fmt: skip

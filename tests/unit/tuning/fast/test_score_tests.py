@@ -15,10 +15,12 @@ from loopwright.tuning.fast.score_tests import (
     fading,
     late,
     pv_above_rest,
+    since_step,
     squared,
 )
 from loopwright.tuning.fast.structure_choice import choose_structure
-from loopwright.tuning.identification.output_error import Fit
+from loopwright.tuning.identification.disturbances import by_bic, fit_structures
+from loopwright.tuning.identification.output_error import UNDISTURBED, Fit
 from loopwright.tuning.reasons import Reason
 from tests.unit.tuning.fast.records import FIRST, THREE_LAGS, Bench, pulse_record, record
 
@@ -83,6 +85,30 @@ def test_a_gain_that_changes_in_the_course_of_the_test_is_seen_with_its_size(nam
     # the gain of the model is that of about the middle of the test
     assert abs(size) > 4.0 * deviation and size / (end - 1.0) == pytest.approx(1.0, abs=0.4)
     assert evaluate(fit.record, DesignSpec(1.6)).reason is not None
+
+
+@pytest.mark.parametrize("changed", [0.97, 1.03])
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_gain_that_changes_with_the_new_gains_is_seen_with_its_size(name: str, changed: float) -> None:
+    """For a small change the fit hardly bends: the score is then the change itself."""
+    fit = Fit(pulse_record(*LOOPS[name], noise=0.001, periods=5.0, changed=changed))
+    size, deviation = ScoreTests(fit, min(fit_structures(fit, UNDISTURBED), key=by_bic)).score(since_step)
+    assert size == pytest.approx(changed - 1.0, abs=4.0 * deviation + 0.003)
+
+
+def test_a_gain_that_is_larger_under_the_new_gains_is_said() -> None:
+    fit = Fit(pulse_record(*LOOPS["first order"], noise=0.002, periods=5.0, changed=1.6))
+    shown = ScoreTests(fit, choose_structure(fit).best).changed_with_the_gains()
+    assert shown is not None
+    assert shown.what == f"the plant's gain is {1.0 + shown.size:.2g} times what it was before the new gains took over"
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_plant_that_stays_is_not_told_to_change_with_the_new_gains(name: str, seed: int) -> None:
+    found = pulse_record(*LOOPS[name], noise=0.01, periods=5.0, seed=seed)
+    fit = Fit(replace(found, steps=(found.listened + round(1.7 * found.period),)))
+    assert ScoreTests(fit, choose_structure(fit).best).changed_with_the_gains() is None
 
 
 def test_a_second_path_shows_until_about_the_end_of_the_record() -> None:
