@@ -85,9 +85,9 @@ def likeliest_fault(fit: Fit[ExperimentRecord], best: Fitted, parts: Sequence[Hi
     near = RATIOS[stiction] ** (np.arange(-FINER, FINER + 1) / FINER)
     for _, fault, size in heapq.nlargest(BEST, found, key=itemgetter(0)):
         found += gains(fault, np.asarray(size * near))
-    most, fault, size = max(found, key=itemgetter(0))
+    largest, fault, size = max(found, key=itemgetter(0))
     _, u, u_earlier = next(_positions(record, parts, fault, np.array([size])))
-    return FaultyValve(fault, size, most, u, u_earlier) if most > 0.0 else None
+    return FaultyValve(fault, size, largest, u, u_earlier) if largest > 0.0 else None
 
 
 def models_of_small_faults(
