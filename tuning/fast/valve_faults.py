@@ -107,9 +107,12 @@ def find_valve_fault(fit: Fit[ExperimentRecord], best: Fitted) -> ValveFault | N
 
 
 def _with_fault(record: ExperimentRecord, fault: Fault, size: float) -> ExperimentRecord:
-    """The record with the position of such a valve for MV; every piece begins at rest."""
-    pieces = np.split(record.u / record.input_range, np.cumsum(record.pieces)[:-1])
-    return replace(record, u=record.input_range * np.concatenate([fault(u, size) for u in pieces]))
+    """The record with the position of such a valve for MV, which is followed from where MV of each piece is known."""
+    scale, pieces = record.input_range, np.split(record.u, np.cumsum(record.pieces)[:-1])
+    earlier = record.u_earlier or (np.empty(0),) * len(pieces)
+    whole = [scale * fault(np.append(before, u) / scale, size) for before, u in zip(earlier, pieces, strict=True)]
+    parts = [np.split(u, [len(before)]) for u, before in zip(whole, earlier, strict=True)]
+    return replace(record, u=np.concatenate([u for _, u in parts]), u_earlier=tuple(before for before, _ in parts))
 
 
 def _bic(each: tuple[Fitted, object, float]) -> float:

@@ -25,7 +25,7 @@ from loopwright.tuning.operation.history import HistoryPart
 SMALLEST, LARGEST = 0.005, 0.1
 """Sizes of a fault that are tried, as fractions of the largest deviation of MV."""
 RATIOS: dict[Fault, float] = {backlash: 1.05, stiction: 1.01}
-"""Ratio of each size to the one before: when a valve that sticks jumps tells its stiction sharply."""
+"""Ratio of each size to the one before. The times at which a valve that sticks jumps show its stiction sharply."""
 BEST, FINER = 8, 10
 """How many of these sizes are tried again with their neighbours, and the number of those on either side."""
 TOGETHER = 50
@@ -41,20 +41,20 @@ class FaultyValve:
     """A valve with a fault.
 
     size: the size of the fault, in MV units.
-    gain: by how much chi-squared of the residual would be smaller with the fault, by its score test.
+    chi_squared_decrease: by how much chi-squared of the residual would be smaller, by the score test of the fault.
     u, u_earlier: the position of the valve in the record and before each piece, as `ExperimentRecord`.
     """
 
     fault: Fault
     size: float
-    gain: float
+    chi_squared_decrease: float
     u: Reals
     u_earlier: tuple[Reals, ...]
 
     @property
     def clear(self) -> bool:
         """Whether the score test is beyond chance."""
-        return self.gain > STANDARD_DEVIATIONS**2
+        return self.chi_squared_decrease > STANDARD_DEVIATIONS**2
 
     @property
     def in_words(self) -> str:
@@ -69,11 +69,11 @@ def likeliest_fault(fit: Fit[ExperimentRecord], best: Fitted, parts: Sequence[Hi
     """
     tests, record = ScoreTests(fit, best), fit.record
 
-    def gains(fault: Fault, sizes: Reals) -> Iterator[tuple[float, Fault, float]]:
+    def scored(fault: Fault, sizes: Reals) -> Iterator[tuple[float, Fault, float]]:
         for size, u, u_earlier in _positions(record, parts, fault, sizes):
-            yield gain(u - record.u, u_earlier), fault, size
+            yield decrease(u - record.u, u_earlier), fault, size
 
-    def gain(further: Reals, u_earlier: tuple[Reals, ...]) -> float:
+    def decrease(further: Reals, u_earlier: tuple[Reals, ...]) -> float:
         before = tuple(each - mv for each, mv in zip(u_earlier, record.u_earlier, strict=True))
         share, deviation = tests.score(lambda _: further, before)
         return (2.0 * share - 1.0) / deviation**2
@@ -81,10 +81,10 @@ def likeliest_fault(fit: Fit[ExperimentRecord], best: Fitted, parts: Sequence[Hi
     found: list[tuple[float, Fault, float]] = []
     for fault, ratio in RATIOS.items():
         count = math.ceil(math.log(LARGEST / SMALLEST, ratio))
-        found += gains(fault, np.asarray(record.input_range * SMALLEST * ratio ** np.arange(count)))
+        found += scored(fault, np.asarray(record.input_range * SMALLEST * ratio ** np.arange(count)))
     near = RATIOS[stiction] ** (np.arange(-FINER, FINER + 1) / FINER)
     for _, fault, size in heapq.nlargest(BEST, found, key=itemgetter(0)):
-        found += gains(fault, np.asarray(size * near))
+        found += scored(fault, np.asarray(size * near))
     largest, fault, size = max(found, key=itemgetter(0))
     _, u, u_earlier = next(_positions(record, parts, fault, np.array([size])))
     return FaultyValve(fault, size, largest, u, u_earlier) if largest > 0.0 else None
