@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cmath
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -284,6 +285,15 @@ def test_a_table_has_a_row_for_each_case_and_sums_up_the_two_classes() -> None:
 def test_a_whole_run_on_a_second_path_later_than_the_record(method: str) -> None:
     found = measure((PLANT, method, "second path: 0.3 of the effect 8 Pu later", 1))
     assert found.reason is None and found.Ms is not None and 1.9 < found.Ms < 2.3
+
+
+def test_a_gain_that_is_larger_under_the_new_gains_is_refused_after_the_step_back() -> None:
+    """Gains were proposed with which Ms is 2.07, as a load disturbance with the step would look the same."""
+    plant = next(each for each in trouble_plants() if each.name == "lag, dead time 1")
+    found = measure((plant, "setpoint", "gain changes with the new gains: x 1.6, 5 % noise", 1))
+    assert found.reason == "unexplained"
+    shown = re.search(r"the plant's gain is ([0-9.]+) times what it was before the new gains took over", found.detail)
+    assert shown is not None and 1.3 < float(shown[1]) < 1.9
 
 
 @pytest.mark.parametrize(
