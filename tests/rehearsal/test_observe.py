@@ -12,6 +12,7 @@ from benchmarks.random_plants import random_plant
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
+from loopwright.service.observing.observed import operation_fields
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.controller_check import check_controller
 from loopwright.tuning.fast.design import DesignSpec
@@ -158,6 +159,7 @@ def test_a_valve_that_sticks_is_found_with_its_stiction_and_the_plant_behind_it(
     assert found.valve is not None and found.valve.fault is stiction
     assert found.valve.size == pytest.approx(0.02, rel=0.05)
     assert found.valve.in_words == "a valve that sticks until MV is off by about 0.02"
+    assert str(operation_fields(found, None, SLUGGISH)["known"]).endswith(f", behind {found.valve.in_words}")
     assert true_Ms(LAG, found) == pytest.approx(1.6, abs=0.05)
     assert isinstance(known_plant(found, TS, 0.0), NothingKnown), "no trial is fitted together with such a record"
 
