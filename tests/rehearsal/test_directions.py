@@ -25,6 +25,7 @@ from loopwright.tuning.fast.setpoint_procedure import setpoint
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.plan import Mode, Sample
+from loopwright.tuning.reasons import Reason
 from tests.rehearsal.test_excitation_choice import Heard
 from tests.rehearsal.test_fast import PLANTS, true_Ms
 from tests.rehearsal.test_setpoint import ultimate, under
@@ -85,10 +86,12 @@ class TwoSided(LinearPlant):
         return super().step(mv if mv > 0.0 else self.below * mv)
 
 
-def of_two_sided(below: float, directions: Directions, Kp: float = 1.0, Ti: float = 8.0) -> RunResult[FastProposal]:
+def of_two_sided(
+    below: float, directions: Directions, Kp: float = 1.0, Ti: float = 8.0, seed: int = 3
+) -> RunResult[FastProposal]:
     """The end of a test of a lag of 10 s with a gain of 2 and a dead time of 2 s above rest, noise 0.5 %."""
     Ts = 0.1
-    plant = TwoSided([2.0], [10.0, 1.0], 2.0, Ts, noise_std=0.005, seed=3)
+    plant = TwoSided([2.0], [10.0, 1.0], 2.0, Ts, noise_std=0.005, seed=seed)
     plant.below = below
     gains = Gains(Kp, Ti)
     channel = Channel(Ts, Settings(-1e3, 1e3, 0.0, pv_low=-1e3, pv_high=1e3), Parameters(Kp, Ti), 0.0, Mode.AUTOMATIC)
@@ -105,11 +108,19 @@ def test_a_gain_that_differs_below_is_refused_where_MV_goes_there(below: float, 
 
 
 def test_where_MV_hardly_goes_there_the_gains_hold_for_the_side_that_was_tested() -> None:
-    found = of_two_sided(0.7, Directions.UP, 0.25, 12.0).value
-    assert found is not None and any(UNSEEN in note for note in found.notes)
-    above, below = (margins(FOPDT(K, 10.0, 2.0 + 0.05), found.gains).Ms for K in (2.0, 1.4))
-    assert above == pytest.approx(1.6, abs=0.05)
-    assert below < 1.5, "another one, which the test cannot know"
+    """Whether the difference shows is a matter of the noise, and in a close case of the processor."""
+    proposed = 0
+    for Ti, seed in ((12.0, 2), (12.0, 6), (20.0, 3)):
+        made = of_two_sided(0.7, Directions.UP, 0.25, Ti, seed)
+        if made.value is None:
+            assert made.ended is not None and made.ended.reason in (Reason.UNEXPLAINED, Reason.MODEL_MISMATCH)
+            continue
+        proposed += 1
+        assert any(UNSEEN in note for note in made.value.notes)
+        above, below = (margins(FOPDT(K, 10.0, 2.0 + 0.05), made.value.gains).Ms for K in (2.0, 1.4))
+        assert above == pytest.approx(1.6, abs=0.05)
+        assert below < 1.5, "another one, which the test cannot know"
+    assert proposed
 
 
 class TestRefused:

@@ -48,5 +48,5 @@ _filter = compiled_filter() or public_filter()  # as this module is imported, an
 
 def recursive(recursion: Reals, u: Reals) -> Reals:
     """The solution y of recursion[0] y[n] + recursion[1] y[n-1] + ... = u[n], at rest before n = 0; u, y: shape
-    (N,)."""
+    (..., N)."""
     return _filter(np.ones(1), recursion, u)

@@ -41,20 +41,24 @@ class Pulses:
         return Pulses(self.forward[which], self.recursion[which], self.delay[which])
 
     def drive(self, u: Reals, count: int | None = None) -> Reals:
-        """The first `count` states under u, 0 before the first sample, shape (plants, len(u), states)."""
+        """The first `count` states under u, 0 before the first sample, shape (plants, *u.shape, states).
+
+        u: shape (N,), or (records, N) for several records, each with a start of its own.
+        """
         forward = np.swapaxes(self.forward[:, :, :count], 1, 2)
-        plants, _, taps = forward.shape
+        forward = forward.reshape(len(forward), *(1,) * (u.ndim - 1), *forward.shape[1:])
+        taps, samples = forward.shape[-1], u.shape[-1]
         # one recursion for all states of a plant; what tells them apart is a short sum over its last values
-        common = np.zeros((plants, 1, len(u) + taps - 2))
-        for row, recursion, delay in zip(common[:, 0], self.recursion, self.delay.tolist(), strict=True):
-            if (length := len(u) - 1 - delay) > 0:
-                row[len(row) - length :] = recursive(recursion, u[:length])
+        common = np.zeros((len(forward), *u.shape[:-1], 1, samples + taps - 2))
+        for row, recursion, delay in zip(common[..., 0, :], self.recursion, self.delay.tolist(), strict=True):
+            if (length := samples - 1 - delay) > 0:
+                row[..., row.shape[-1] - length :] = recursive(recursion, u[..., :length])
         # time runs along the last axis until all is summed: numpy is slow along an axis of two or three states
-        driven = common[:, :, : len(u)] * forward[:, :, -1:]
+        driven = common[..., :samples] * forward[..., -1:]
         tap = np.empty_like(driven)
         for k in range(1, taps - 1):
-            driven += np.multiply(common[:, :, k : k + len(u)], forward[:, :, -1 - k, None], out=tap)
-        return np.ascontiguousarray(np.swapaxes(driven, 1, 2))
+            driven += np.multiply(common[..., k : k + samples], forward[..., -1 - k, None], out=tap)
+        return np.ascontiguousarray(np.swapaxes(driven, -1, -2))
 
 
 def states(monic: Reals, L: float, u: Reals, count: int) -> Reals:

@@ -23,6 +23,7 @@ from loopwright.tuning.identification.output_error import (
     Fit,
     Fitted,
 )
+from loopwright.tuning.identification.regressors import Regressors
 from loopwright.tuning.identification.variable_projection import SearchBounds
 from loopwright.tuning.models import Reals
 
@@ -61,16 +62,16 @@ def _fitted(fit: Fit[ExperimentRecord], best: Fitted, alternative: GainAlternati
     second = Fit(replace(fit.record, u=alternative.changed(fit.record)))
     inputs, lags = structure.inputs, structure.lags
 
-    def columns(at: Reals) -> Reals:
-        first = fit.regressors(structure, hypothesis, at)
-        return np.concatenate((first, second.regressors(structure, hypothesis, at)[:, :, :inputs]), axis=2)
+    def regressors(at: Reals) -> Regressors:
+        first, further = (each.regressors(structure, hypothesis, at).common for each in (fit, second))
+        return Regressors(np.concatenate((first, further[:, :, :inputs]), axis=2))
 
     bounds = SearchBounds(
         *fit.bounds(structure, hypothesis),
         np.append(np.full(lags, MAX_LOG_STEP), 0.25 * fit.period),
         np.append(np.full(lags, LOG_STEP), LOG_STEP * fit.period),
     )
-    found = fit_without_loads(fit, best, columns, best.theta[None, : structure.searched], bounds)
+    found = fit_without_loads(fit, best, regressors, best.theta[None, : structure.searched], bounds)
     linear, changing = (
         at_the_ultimate_period(fit, best, found.at, each)
         for each in (found.coefficients[:inputs], found.coefficients[-inputs:])

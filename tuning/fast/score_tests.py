@@ -10,15 +10,15 @@ Lagrange multiplier test, C. R. Rao, Proc. Cambridge Phil. Soc. 44, 1948.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.fast.uncertainty import durbin_watson_ratio, unknown_columns
-from loopwright.tuning.identification.output_error import UNDISTURBED, Fit, Fitted
+from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.models import Reals
 
 STANDARD_DEVIATIONS = 4.0
@@ -149,16 +149,23 @@ class ScoreTests:
         changed: the further input of the alternative, MV units, shape (N,), from the record; the size multiplies it.
         before: this input before each piece of several, as `ExperimentRecord.u_earlier`; without it there was none.
         """
-        fit, found = self._fit, self._found
-        structure, inputs = found.structure, found.structure.inputs
-        moved = changed(fit.record)
+        moved = changed(self._fit.record)
         if not np.any(moved):  # MV was never above rest, or the record ends before the delay
             return 0.0, math.inf
-        further = Fit(replace(fit.record, u=moved, u_earlier=before))
-        # a record's input range is its own: the scale of MV must stay that of the fit
-        scale = further.record.input_range / fit.record.input_range
-        columns = further.regressors(structure, UNDISTURBED, found.theta[None, : structure.searched])[0]
-        return self._regression(scale * (columns[:, :inputs] @ found.linear.coefficients[:inputs]))
+        sizes, deviations = self.scores(moved[None], [each[None] for each in before])
+        return float(sizes[0]), float(deviations[0])
+
+    def scores(self, further: Reals, before: Sequence[Reals] = ()) -> tuple[Reals, Reals]:
+        """The sizes of many alternatives, as fractions of the plant's gain, and their standard deviations, shape
+        (alternatives,).
+
+        further: the further inputs of the alternatives, MV units, shape (alternatives, N). before: these inputs before
+        each piece of several, shape (alternatives, samples) each.
+        """
+        fit, found = self._fit, self._found
+        inputs = found.structure.inputs
+        columns = fit.answers(found.structure, found.theta, fit.lines(further, before))
+        return self._regressions((columns @ found.linear.coefficients[:inputs]).T)
 
     def later_since(self, piece: int) -> tuple[float, float]:
         """By how much the dead time is longer in this piece of the record and those after it than before, in samples,
@@ -179,11 +186,18 @@ class ScoreTests:
 
     def _regression(self, column: Reals) -> tuple[float, float]:
         """The coefficient of a further column of the record in the residual, and its standard deviation."""
-        response = self._without_known(column)
-        power = float(response @ response)
-        if power <= 0.0:
-            return 0.0, math.inf
-        return float(response @ self._unexplained) / power, math.sqrt(self._variance / power)
+        sizes, deviations = self._regressions(column[:, None])
+        return float(sizes[0]), float(deviations[0])
+
+    def _regressions(self, columns: Reals) -> tuple[Reals, Reals]:
+        """The coefficients of further columns of the record, each alone, in the residual, and their standard
+        deviations; columns of shape (rows, alternatives)."""
+        responses = self._without_known(columns)
+        power = np.einsum("ij,ij->j", responses, responses)
+        seen = power > 0.0
+        power = np.where(seen, power, 1.0)
+        sizes = np.where(seen, (self._unexplained @ responses) / power, 0.0)
+        return sizes, np.where(seen, np.sqrt(self._variance / power), math.inf)
 
     def _delays(self) -> list[int]:
         """The delays of a second path that are tried, in samples, up to the length of the longest piece's test."""
@@ -196,7 +210,7 @@ class ScoreTests:
         return found
 
     def _without_known(self, values: Reals) -> Reals:
-        """What is left of a column of the record, shape (rows,), by everything that the fit can explain."""
+        """What is left of columns of the record, shape (rows, ...), by everything that the fit can explain."""
         return np.asarray(values - self._basis @ (self._basis.T @ values))
 
 

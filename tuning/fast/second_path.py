@@ -22,6 +22,7 @@ from loopwright.tuning.identification.output_error import (
     Fitted,
     sums_of_squares_left,
 )
+from loopwright.tuning.identification.regressors import Regressors
 from loopwright.tuning.identification.variable_projection import SearchBounds
 from loopwright.tuning.models import Reals
 
@@ -61,19 +62,19 @@ def find_second_path(fit: Fit[ExperimentRecord], best: Fitted) -> SecondPath | N
         return None
     inputs, lags = structure.inputs, structure.lags
 
-    def columns(at: Reals) -> Reals:
+    def regressors(at: Reals) -> Regressors:
         """The regressors at points of theta and then the delay of the second path, shape (points, rows, columns)."""
         later = at[:, :-1].copy()
         later[:, lags] += at[:, -1]
-        first = fit.regressors(structure, hypothesis, at[:, :-1])
-        return np.concatenate((first, fit.regressors(structure, hypothesis, later)[:, :, :inputs]), axis=2)
+        first, second = (fit.regressors(structure, hypothesis, each).common for each in (at[:, :-1], later))
+        return Regressors(np.concatenate((first, second[:, :, :inputs]), axis=2))
 
     start = best.theta[: structure.searched]
     spacing = SPACING * fit.period
     starts = [np.append(start, at) for at in np.arange(spacing, longest - start[lags], spacing)]
     if not starts:
         return None
-    rss = np.concatenate([sums_of_squares_left(columns(at[None]), fit.y) for at in starts])
+    rss = np.concatenate([sums_of_squares_left(regressors(at[None]).common, fit.y) for at in starts])
     begun = np.array([starts[i] for i in np.argsort(rss, kind="stable")[:STARTS]])
     low, high = fit.bounds(structure, hypothesis)
     bounded = SearchBounds(
@@ -82,7 +83,7 @@ def find_second_path(fit: Fit[ExperimentRecord], best: Fitted) -> SecondPath | N
         np.append(np.full(lags, MAX_LOG_STEP), np.full(2, 0.25 * fit.period)),
         np.append(np.full(lags, LOG_STEP), np.full(2, LOG_STEP * fit.period)),
     )
-    found = fit_without_loads(fit, best, columns, begun, bounded, chosen_among_many=1)
+    found = fit_without_loads(fit, best, regressors, begun, bounded, chosen_among_many=1)
     share = _share(fit, best, found)
     if share < MIN_SHARE:
         return None

@@ -100,7 +100,7 @@ def _drifts(fit: Fit[ExperimentRecord], found: Fitted) -> bool:
     """Whether a slope of PV in each piece explains more of the residual than chance would, by AIC: two variances of the
     noise for each of them."""
     structure, pieces = found.structure, len(fit.pieces)
-    everything = fit.regressors(structure, replace(found.hypothesis, drift=True), found.theta[None])[0]
+    everything = fit.regressors(structure, replace(found.hypothesis, drift=True), found.theta[None]).dense()[0]
     slopes = everything[:, structure.inputs + pieces : structure.inputs + 2 * pieces]
     known = np.linalg.qr(unknown_columns(fit, found))[0]
     basis = np.linalg.qr(slopes - known @ (known.T @ slopes))[0]

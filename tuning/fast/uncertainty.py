@@ -58,7 +58,7 @@ def unknown_columns(fit: Fit[ExperimentRecord], found: Fitted) -> Reals:
     if fit.starts_are_free:
         return sensitivities(fit, found)
     other = DisturbanceHypothesis(drift=True, not_at_rest_initially=True)
-    everything = fit.regressors(found.structure, other, found.theta[None, : found.structure.searched])[0]
+    everything = fit.regressors(found.structure, other, found.theta[None, : found.structure.searched]).dense()[0]
     first = fit.first_load(found.structure, found.hypothesis)  # the level of PV is among the columns already
     return np.column_stack((sensitivities(fit, found), everything[:, first:]))
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.identification.output_error import FLOOR, Fit, Fitted
+from loopwright.tuning.identification.regressors import Regressors
 from loopwright.tuning.identification.variable_projection import SearchBounds, descend, solve
 from loopwright.tuning.models import Reals
 
@@ -34,23 +35,23 @@ class WithoutLoads:
 def fit_without_loads(
     fit: Fit[ExperimentRecord],
     best: Fitted,
-    columns: Callable[[Reals], Reals],
+    regressors: Callable[[Reals], Regressors],
     starts: Reals,
     bounds: SearchBounds,
     chosen_among_many: int = 0,
 ) -> WithoutLoads:
     """The fit that is reached from these starts.
 
-    columns: the regressors at points of the searched parameters, shape (points, rows, columns).
+    regressors: gives a set of regressors for each point of the searched parameters.
     starts: shape (starts, searched parameters).
     chosen_among_many: how many of the parameters were chosen among many first guesses: those count twice in BIC, as
     the time of a load disturbance does.
     """
-    points, left = descend(columns, fit.y, starts, bounds, MAX_STEPS, RELATIVE_DECREASE)
+    points, left = descend(regressors, fit.y, starts, bounds, MAX_STEPS, RELATIVE_DECREASE)
     at = points[int(np.argmin(left))]
-    regressors = columns(at[None])[0]
-    linear = solve(regressors, fit.y)
-    parameters = len(at) + regressors.shape[1] + chosen_among_many
+    columns = regressors(at[None]).dense()[0]
+    linear = solve(columns, fit.y)
+    parameters = len(at) + columns.shape[1] + chosen_among_many
     bic = fit.samples * math.log(linear.rss / fit.samples + FLOOR**2) + parameters * math.log(fit.samples)
     rms = math.sqrt(linear.rss / len(linear.residual))
     return WithoutLoads(at, linear.coefficients, best.bic - bic, rms)

@@ -250,7 +250,7 @@ def rss_by_load_time(fit: Fit[S], structure: Structure, thetas: Reals, shifts: N
     The time of a load disturbance only shifts its response, so one response serves all times.
     """
     order = structure.order
-    columns = fit.regressors(structure, DisturbanceHypothesis(thetas.shape[1] - structure.searched), thetas)
+    columns = fit.regressors(structure, DisturbanceHypothesis(thetas.shape[1] - structure.searched), thetas).dense()
     base = np.linalg.qr(columns)[0]
     basis = np.swapaxes(base, 1, 2)
     rest = fit.y - (base @ (basis @ fit.y)[:, :, None])[:, :, 0]

@@ -4,7 +4,7 @@ needed."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from typing import Generic, Protocol, TypeVar
@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.tuning.analysis.zero_order_hold import pulses
-from loopwright.tuning.identification.projection import REDUNDANT, LocalRegressors, Projection
+from loopwright.tuning.identification.projection import REDUNDANT, Projection
+from loopwright.tuning.identification.regressors import OwnColumns, PieceRows, Regressors
 from loopwright.tuning.identification.structures import Structure
 from loopwright.tuning.identification.variable_projection import LinearFit, SearchBounds, descend, solve
 from loopwright.tuning.models import Reals, TransferFunction
@@ -136,23 +137,20 @@ class Fit(Generic[S]):
     def __init__(self, record: S) -> None:
         self.record = record
         self.block = record.block
-        kept, self.pieces = _whole_blocks(record.pieces, self.block)
+        self._kept, self.pieces = _whole_blocks(record.pieces, self.block)
         self.rows = [slice(piece.start // self.block, piece.stop // self.block) for piece in self.pieces]
-        self.u = record.u[kept] / record.input_range
-        before = record.u_earlier or [np.empty(0)] * len(self.pieces)
-        self._driving = [
-            (np.append(each / record.input_range, self.u[piece]), len(each))
-            for each, piece in zip(before, self.pieces, strict=True)
-        ]
-        self.y = averaged(record.y[kept] / record.output_range, self.block)
+        self._of_pieces = PieceRows([rows.stop - rows.start for rows in self.rows])
+        self.u = record.u[self._kept] / record.input_range
+        self._driving = self.lines(record.u, record.u_earlier)
+        self.y = averaged(record.y[self._kept] / record.output_range, self.block)
         self.samples = len(self.y)
         self.period = record.period
         self._step = np.ones(len(self.u))
         self._longest = max(piece.stop - piece.start for piece in self.pieces)
-        self._level, self._slope = (
-            averaged(_of_each_piece(self.pieces, function), self.block)
-            for function in (np.ones, lambda length: np.linspace(-1.0, 1.0, length))
-        )
+        self._ramps = np.zeros((len(self.pieces), self._of_pieces.longest))
+        for line, piece in zip(self._ramps, self.pieces, strict=True):
+            ramp = averaged(np.linspace(-1.0, 1.0, piece.stop - piece.start), self.block)
+            line[: len(ramp)] = ramp
         self._rate = math.log(1.0 / self.period)
         self._grids: dict[tuple[Structure, int, float | None, tuple[float, ...], bool], list[Reals]] = {}
 
@@ -163,12 +161,36 @@ class Fit(Generic[S]):
         """Whether every piece begins in a state of its own, under every disturbance hypothesis."""
         return len(self.pieces) > 1
 
+    def lines(self, u: Reals, earlier: Sequence[Reals]) -> Reals:
+        """Inputs in units of MV's range, one line for each piece, with zeros before it; shape (..., pieces, samples).
+
+        u: MV units, shape (..., N). earlier: what they were before each piece, shape (..., samples) each.
+        """
+        whole, scale = u[..., self._kept], self.record.input_range
+        before = earlier or [u[..., :0]] * len(self.pieces)
+        longest = max(piece.stop - piece.start + e.shape[-1] for piece, e in zip(self.pieces, before, strict=True))
+        found = np.zeros((*u.shape[:-1], len(self.pieces), longest))
+        for i, (piece, e) in enumerate(zip(self.pieces, before, strict=True)):
+            begin = longest - (piece.stop - piece.start)
+            found[..., i, begin - e.shape[-1] : begin] = e / scale
+            found[..., i, begin:] = whole[..., piece] / scale
+        return found
+
+    def answers(self, structure: Structure, theta: Reals, lines: Reals) -> Reals:
+        """What the plant makes of several inputs, shape (inputs, rows, columns of the plant's input); lines as `lines`
+        gives them."""
+        plant = pulses(structure.monic(theta[None, : structure.searched]), theta[[structure.lags]], structure.order)
+        found = [self._of_last_samples(plant.drive(lines, structure.zeros + 1)[0])]
+        if structure.feed_through:
+            found.append(self._of_last_samples(_delayed(lines, int(plant.delay[0]))[..., None]))
+        return np.concatenate(found, axis=2)
+
     def first_load(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> int:
         """The first linear coefficient of the load disturbances; each of them has as many as the structure's order."""
         return structure.inputs + len(self.pieces) * (1 + hypothesis.drift)
 
-    def regressors(self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals) -> Reals:
-        """The regressors of all linear parameters for each theta, shape (thetas, rows, columns)."""
+    def regressors(self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals) -> Regressors:
+        """The regressors of all linear parameters for each theta."""
         many, inputs, order = len(thetas), structure.zeros + 1, structure.order
         # one call serves MV and every load disturbance, as call overhead dominates
         times = thetas[:, structure.lags :].T
@@ -176,56 +198,57 @@ class Fit(Generic[S]):
         if free:
             # a step of every state at the start represents any initial state, and a load disturbance
             times = np.append(times, np.zeros((1, many)), axis=0)
-        steps = len(times) - 1
-        loads = steps - free
-        answers = pulses(np.tile(structure.monic(thetas), (1 + steps, 1)), times.ravel(), order)
-        driven, stepped = answers.of(slice(many)), answers.of(slice(many, None))
-        always = (self._level, self._slope)[: 1 + hypothesis.drift]
-        width = self.first_load(structure, hypothesis) + order * (loads + free * len(self.pieces))
-        out = np.zeros((many, self.samples, width))
-        for rows, (u, earlier) in zip(self.rows, self._driving, strict=True):
-            out[:, rows, :inputs] = averaged(driven.drive(u, inputs)[:, earlier:], self.block, 1)
+        loads = len(times) - 1 - free
+        answers = pulses(np.tile(structure.monic(thetas), (len(times), 1)), times.ravel(), order)
+        driven = answers.of(slice(many))
+        given = [self._of_last_samples(driven.drive(self._driving, inputs))]
         if structure.feed_through:
-            out[:, :, inputs] = averaged(self._delayed(driven.delay), self.block, 1)
-        at = structure.inputs
-        for columns in always:
-            out[:, :, at : at + len(self.pieces)] = columns
-            at += len(self.pieces)
-        if not steps:
-            return out
-        # a start ends with its piece
-        moved = averaged(stepped.drive(self._step if loads else self._step[: self._longest]), self.block, 1)
-        for k in range(loads):
-            load = out[:, :, at : at + order]
-            load[:] = moved[k * many : (k + 1) * many]
-            if len(self.pieces) > 1:
-                self._end_with_piece(load, times[1 + k])
-            at += order
-        for rows in self.rows if free else ():
-            out[:, rows, at : at + order] = moved[loads * many :, : rows.stop - rows.start]
-            at += order
-        return out
+            delayed = np.array([_delayed(self._driving, late) for late in driven.delay.tolist()])
+            given.append(self._of_last_samples(delayed[..., None]))
+        moved = np.empty((0, 0, order))
+        if loads or free:
+            # a start ends with its piece
+            steps = self._step if loads else self._step[: self._longest]
+            moved = averaged(answers.of(slice(many, None)).drive(steps), self.block, 1)
+        loaded = [moved[k * many : (k + 1) * many] for k in range(loads)]
+        started = moved[loads * many :]
+        if self.starts_are_free:
+            for times_of_load, load in zip(times[1 : 1 + loads], loaded, strict=True):
+                self._end_with_piece(load, times_of_load)
+            own = self._own(hypothesis, started[:, : self._of_pieces.longest])
+            return Regressors(np.concatenate((*given, *loaded), axis=2), own, self.places(structure, hypothesis))
+        always = [np.broadcast_to(1.0, (many, self.samples, 1))]
+        always += [np.broadcast_to(self._ramps[0, :, None], (many, self.samples, 1))] if hypothesis.drift else []
+        return Regressors(np.concatenate((*given, *always, *loaded, *([started] if free else [])), axis=2))
 
-    def local_regressors(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> list[LocalRegressors]:
-        """The regressors of each of several pieces: its level, its slope where PV drifts, and its start."""
-        if not self.starts_are_free:
-            return []
+    def _own(self, hypothesis: DisturbanceHypothesis, started: Reals) -> Reals:
+        """The level, the slope where PV drifts, and the start of each of several pieces, as `Regressors.own`."""
+        inside = self._of_pieces.inside
+        first = 1 + hypothesis.drift
+        own = np.empty((len(started), *inside.shape, first + started.shape[-1]))
+        own[..., 0] = inside
+        if hypothesis.drift:
+            own[..., 1] = self._ramps
+        np.multiply(started[:, None], inside[:, :, None], out=own[..., first:])
+        return own
+
+    def places(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> OwnColumns:
+        """Which of the regressors belong to one of several pieces: its level, its slope where PV drifts, and its
+        start."""
         pieces, order = len(self.pieces), structure.order
-        levels = structure.inputs + pieces * np.arange(1 + hypothesis.drift)
-        starts = self.first_load(structure, hypothesis) + order * hypothesis.load_disturbances + np.arange(order)
-        found = [LocalRegressors(rows, np.append(levels + i, starts + order * i)) for i, rows in enumerate(self.rows)]
-        # the rows of a very short piece do not span its own regressors
-        return [each for each in found if each.rows.stop - each.rows.start > len(each.columns)]
+        loads = self.first_load(structure, hypothesis) + np.arange(order * hypothesis.load_disturbances)
+        starts = self.first_load(structure, hypothesis) + len(loads) + np.arange(order * pieces).reshape(pieces, order)
+        levels = structure.inputs + np.arange(pieces)[:, None] + pieces * np.arange(1 + hypothesis.drift)
+        common = np.concatenate((np.arange(structure.inputs), loads))
+        return OwnColumns(self._of_pieces, common, np.concatenate((levels, starts), axis=1))
 
-    def _delayed(self, delay: NDArray[np.int64]) -> Reals:
-        """MV a sample and the whole samples of the dead time later, shape (plants, N)."""
-        delayed = np.zeros((len(delay), len(self.u)))
-        for piece, (u, earlier) in zip(self.pieces, self._driving, strict=True):
-            for row, late in zip(delayed, delay.tolist(), strict=True):
-                if late + 1 < len(u):
-                    moved = np.append(np.zeros(late + 1), u[: len(u) - late - 1])
-                    row[piece] = moved[earlier:]
-        return delayed
+    def _of_last_samples(self, lines: Reals) -> Reals:
+        """The averages of the last samples of each piece's line, as many as the piece has, in the rows of the record.
+
+        lines: shape (plants, pieces, samples, signals). Returned: shape (plants, rows, signals).
+        """
+        last = averaged(lines[:, :, lines.shape[2] - self._longest :], self.block, 2)
+        return self._of_pieces.record_of_ends(last)
 
     def _end_with_piece(self, responses: Reals, times: Reals) -> None:
         """Ends the responses to load disturbances, shape (plants, rows, states), with the piece that each begins in."""
@@ -236,7 +259,7 @@ class Fit(Generic[S]):
 
     def fitted(self, structure: Structure, hypothesis: DisturbanceHypothesis, theta: Reals) -> Fitted:
         """The fit at this theta: the linear parameters by least squares."""
-        columns = self.regressors(structure, hypothesis, theta[None])[0]
+        columns = self.regressors(structure, hypothesis, theta[None]).dense()[0]
         linear = solve(columns, self.y)
         # the time of a load disturbance was chosen among many: it counts twice
         parameters = len(theta) + columns.shape[1] + hypothesis.load_disturbances
@@ -273,12 +296,11 @@ class Fit(Generic[S]):
         max_step = np.append(np.full(structure.lags, MAX_LOG_STEP), np.full(times, 0.25 * self.period))
         step = np.append(np.full(structure.lags, LOG_STEP), np.full(times, LOG_STEP * self.period))
 
-        def columns(thetas: Reals) -> Reals:
+        def regressors(thetas: Reals) -> Regressors:
             return self.regressors(structure, hypothesis, thetas)
 
         bounded = SearchBounds(low, high, max_step, step)
-        local = self.local_regressors(structure, hypothesis)
-        found, rss = descend(columns, self.y, np.array(starts), bounded, max_steps, RELATIVE_DECREASE, local)
+        found, rss = descend(regressors, self.y, np.array(starts), bounded, max_steps, RELATIVE_DECREASE)
         return [found[i] for i in np.argsort(rss, kind="stable")]
 
     def bounds(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> tuple[Reals, Reals]:
@@ -340,8 +362,10 @@ class Fit(Generic[S]):
         return self.distinct([thetas[i] for i in np.argsort(rss)], structure, keep)
 
     def _sums_of_squares_left(self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals) -> Reals:
-        columns, local = self.regressors(structure, hypothesis, thetas), self.local_regressors(structure, hypothesis)
-        return Projection.of(columns, self.y, local).rss if local else sums_of_squares_left(columns, self.y)
+        regressors = self.regressors(structure, hypothesis, thetas)
+        if regressors.own is not None:
+            return Projection.of(regressors, self.y).rss
+        return sums_of_squares_left(regressors.common, self.y)
 
     def distinct(self, ranked: Sequence[Reals], structure: Structure, keep: int) -> list[Reals]:
         """The first `keep` of the ranked theta that are not close to an earlier one."""
@@ -418,12 +442,11 @@ def _whole_blocks(lengths: Sequence[int], block: int) -> tuple[slice | NDArray[n
     return np.concatenate(kept), tuple(slice(int(stop - w), int(stop)) for stop, w in zip(stops, whole, strict=True))
 
 
-def _of_each_piece(pieces: Sequence[slice], function: Callable[[int], Reals]) -> Reals:
-    """One column for each piece, shape (N, pieces): the function of the piece's length there, 0 elsewhere."""
-    columns = np.zeros((pieces[-1].stop, len(pieces)))
-    for i, piece in enumerate(pieces):
-        columns[piece, i] = function(piece.stop - piece.start)
-    return columns
+def _delayed(lines: Reals, late: int) -> Reals:
+    """Inputs, shape (..., samples), a sample and the whole samples of a dead time later."""
+    found = np.zeros(lines.shape)
+    found[..., late + 1 :] = lines[..., : max(lines.shape[-1] - late - 1, 0)]
+    return found
 
 
 def averaged(columns: Reals, block: int, axis: int = 0) -> Reals:

@@ -20,6 +20,7 @@ from loopwright.tuning.identification.output_error import (
     count,
 )
 from loopwright.tuning.identification.record import RecordedTest
+from loopwright.tuning.identification.regressors import Regressors
 from loopwright.tuning.identification.residuals import variance_inflation, whiteness
 from loopwright.tuning.identification.sensitivity import sensitivities, slopes_of
 from loopwright.tuning.identification.structures import Plant, Structure
@@ -129,11 +130,11 @@ class IdentificationProblem:
         max_step = np.append(np.full(structure.lags, 1.5), np.full(times, max(5.0, 0.2 * self.max_dead_time)))
         step = np.append(np.full(structure.lags, 1e-5), np.full(times, 1e-4))
 
-        def columns(thetas: Reals) -> Reals:
+        def regressors(thetas: Reals) -> Regressors:
             return self.full_fit.regressors(structure, hypothesis, thetas)
 
         bounded = SearchBounds(low, high, max_step, step)
-        found, rss = descend(columns, self.y, np.array(begun), bounded, MAX_STEPS, RELATIVE_DECREASE)
+        found, rss = descend(regressors, self.y, np.array(begun), bounded, MAX_STEPS, RELATIVE_DECREASE)
         return self.fitted(structure, hypothesis, found[np.argmin(rss)])
 
     def fitted(self, structure: Structure, hypothesis: DisturbanceHypothesis, theta: Reals) -> Fitted:

@@ -1,8 +1,7 @@
 """The best linear fit of one output by many sets of regressors, and what is left of a signal beyond a set.
 
-Some regressors are 0 outside a part of the rows: the level and the start of a piece of the record. Their bases are
-found part by part, and the other regressors are made orthogonal to them. One factorisation of all regressors would
-spend most of its time on zeros.
+The bases of the regressors that belong to one piece of the record are found piece by piece, all pieces at once, and the
+other regressors are made orthogonal to them.
 """
 
 from __future__ import annotations
@@ -11,70 +10,56 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from loopwright.tuning.identification.regressors import Flags, Regressors, Rows
 from loopwright.tuning.models import Reals
 
-Rows = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 REDUNDANT = 1e-10
 """Size of a direction, in columns of unit length, below which it is a linear combination of the others."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LocalRegressors:
-    """Regressors that are 0 outside a part of the rows.
-
-    rows: the part; no two of them have a row in common.
-    columns: the places of these regressors among all, shape (columns,).
-    """
-
-    rows: slice
-    columns: Rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
     """The best linear fit of y by each set of regressors.
 
-    columns: the regressors, shape (sets, N, columns).
-    local: which of the regressors are 0 outside which part, the same in all sets.
-    bases: an orthonormal basis of the regressors of each part, shapes (sets, rows, columns).
-    common: an orthonormal basis of the other regressors, orthogonal to those of the parts, shape (sets, N, others).
+    regressors: the regressors.
+    own: an orthonormal basis of the regressors of each piece, shape (sets, pieces, longest, directions); None where no
+    regressor belongs to one piece.
+    common: an orthonormal basis of the other regressors, orthogonal to those of the pieces, shape (sets, N, others).
     linear: the linear coefficients, shape (sets, columns).
     rest: the residual, shape (sets, N).
     """
 
-    columns: Reals
-    local: Sequence[LocalRegressors]
-    bases: Sequence[Reals]
+    regressors: Regressors
+    own: Reals | None
     common: Reals
     linear: Reals
     rest: Reals
 
     @staticmethod
-    def of(columns: Reals, y: Reals, local: Sequence[LocalRegressors] = ()) -> Projection:
-        """The projection of y, shape (N,), on each set; columns and local as above."""
-        sets, _, count = columns.shape
-        lengths = np.sqrt(np.einsum("bij,bij->bj", columns, columns))
-        lengths[lengths == 0.0] = 1.0
-        # a view is faster than indices, and most records have one piece
-        others = np.delete(np.arange(count), np.concatenate([part.columns for part in local])) if local else slice(None)
-        common = columns[:, :, others] / lengths[:, None, others]
-        rest = np.tile(y, (sets, 1))
-        bases, solutions = list[Reals](), list[Reals]()
-        for part in local:
-            own = _Factors.of(columns[:, part.rows, part.columns] / lengths[:, None, part.columns])
-            # the directions of y and, for each of the other regressors, of that
-            along = [_take_out(own.basis, signal[:, part.rows]) for signal in (rest[:, :, None], common)]
-            bases.append(own.basis)
-            solutions.append(own.coefficients(np.concatenate(along, axis=2)))
-        factors = _Factors.of(common)
-        linear = np.empty((sets, count))
-        linear[:, others] = factors.coefficients(_take_out(factors.basis, rest[:, :, None]))[:, :, 0]
-        for part, found in zip(local, solutions, strict=True):
-            linear[:, part.columns] = found[:, :, 0] - (found[:, :, 1:] @ linear[:, others, None])[:, :, 0]
-        return Projection(columns, local, bases, factors.basis, linear / lengths, rest)
+    def of(regressors: Regressors, y: Reals) -> Projection:
+        """The projection of y, shape (N,), on each set."""
+        lengths = _lengths(regressors.common)
+        common = regressors.common / lengths[:, None]
+        rest = np.tile(y[:, None], (len(common), 1, 1))
+        if regressors.own is None or regressors.places is None:
+            factors = _Factors.of(common)
+            linear = factors.coefficients(_take_out(factors.basis, rest))[:, :, 0]
+            return Projection(regressors, None, factors.basis, linear / lengths, rest[:, :, 0])
+        places = regressors.places
+        own_lengths = _lengths(regressors.own)
+        own = _Factors.of(regressors.own / own_lengths[:, :, None])
+        signals = places.rows.table(np.concatenate((rest, common), axis=2))
+        # the directions of y and, for each of the other regressors, of that
+        solutions = own.coefficients(_take_out(own.basis, signals))
+        signals = places.rows.record(signals)
+        rest = np.ascontiguousarray(signals[:, :, :1])
+        factors = _Factors.of(signals[:, :, 1:])
+        found = factors.coefficients(_take_out(factors.basis, rest))
+        linear = np.empty((len(common), places.common.size + places.own.size))
+        linear[:, places.common] = found[:, :, 0] / lengths
+        linear[:, places.own] = (solutions[..., 0] - (solutions[..., 1:] @ found[:, None])[..., 0]) / own_lengths
+        return Projection(regressors, own.basis, factors.basis, linear, rest[:, :, 0])
 
     @property
     def rss(self) -> Reals:
@@ -82,13 +67,16 @@ class Projection:
 
     def fitted(self, which: Rows) -> Reals:
         """What these sets make of y, shape (sets, N)."""
-        return np.asarray((self.columns[which] @ self.linear[which, :, None])[:, :, 0])
+        return self.regressors.of(which).times(self.linear[which])
 
     def beyond(self, signals: Reals, which: Rows) -> Reals:
         """What is left of the signals, shape (sets, N, signals), beyond the regressors of these sets."""
-        left = signals.copy()
-        for part, basis in zip(self.local, self.bases, strict=True):
-            _take_out(basis[which], left[:, part.rows])
+        if self.own is None or self.regressors.places is None:
+            left = signals.copy()
+        else:
+            table = self.regressors.places.rows.table(signals)
+            _take_out(self.own[which], table)
+            left = self.regressors.places.rows.record(table)
         _take_out(self.common[which], left)
         return left
 
@@ -98,16 +86,17 @@ class Projection:
             mine[where] = other[which]
 
     def _arrays(self) -> Sequence[Reals]:
-        return self.columns, *self.bases, self.common, self.linear, self.rest
+        own = [each for each in (self.own, self.regressors.own) if each is not None]
+        return self.regressors.common, *own, self.common, self.linear, self.rest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Factors:
     """Regressors as the product of an orthonormal basis and of square matrices.
 
-    basis: shape (sets, N, directions), 0 where a direction is redundant.
-    square: shape (sets, directions, directions).
-    seen: whether no direction is redundant, shape (sets,).
+    basis: shape (..., N, directions), 0 where a direction is redundant.
+    square: shape (..., directions, directions).
+    seen: whether no direction is redundant, shape (...).
     """
 
     basis: Reals
@@ -116,33 +105,40 @@ class _Factors:
 
     @staticmethod
     def of(columns: Reals) -> _Factors:
-        """columns: regressors of about unit length, shape (sets, N, columns)."""
+        """columns: regressors of about unit length, shape (..., N, columns)."""
         basis, square = np.linalg.qr(columns)
-        seen = np.abs(np.einsum("bii->bi", square)).min(axis=1, initial=np.inf) > REDUNDANT
-        for i in np.flatnonzero(~seen):
+        seen = np.abs(np.einsum("...ii->...i", square)).min(axis=-1, initial=np.inf) > REDUNDANT
+        for i in zip(*np.nonzero(~seen), strict=True):
             directions, sizes, turned = np.linalg.svd(columns[i], full_matrices=False)
             sizes[sizes <= REDUNDANT] = 0.0
             basis[i], square[i] = directions * (sizes > 0.0), sizes[:, None] * turned
         return _Factors(basis, square, seen)
 
     def coefficients(self, along: Reals) -> Reals:
-        """The coefficients of the columns for these directions, shape (sets, directions, signals); the smallest ones
+        """The coefficients of the columns for these directions, shape (..., directions, signals); the smallest ones
         where a direction is redundant."""
         if self.seen.all():
             return np.asarray(np.linalg.solve(self.square, along))
         found = np.empty_like(along)
         found[self.seen] = np.linalg.solve(self.square[self.seen], along[self.seen])
-        for i in np.flatnonzero(~self.seen):
+        for i in zip(*np.nonzero(~self.seen), strict=True):
             found[i] = np.linalg.lstsq(self.square[i], along[i], rcond=REDUNDANT)[0]
         return found
+
+
+def _lengths(columns: Reals) -> Reals:
+    """The lengths of the columns, shape (..., N, columns), 1 where a column is 0."""
+    lengths = np.sqrt(np.einsum("...ij,...ij->...j", columns, columns))
+    lengths[lengths == 0.0] = 1.0
+    return np.asarray(lengths)
 
 
 def _take_out(basis: Reals, signals: Reals) -> Reals:
     """Takes the directions of the basis out of the signals, in place, and returns their coefficients.
 
-    basis: shape (sets, N, directions).
-    signals: shape (sets, N, signals).
+    basis: shape (..., N, directions).
+    signals: shape (..., N, signals).
     """
-    along = np.swapaxes(basis, 1, 2) @ signals
+    along = np.swapaxes(basis, -1, -2) @ signals
     signals -= basis @ along
     return np.asarray(along)

@@ -19,7 +19,7 @@ def sensitivities(fit: Fit[S], found: Fitted) -> Reals:
     step = np.append(np.full(structure.lags, LOG_STEP), np.full(len(found.theta) - structure.lags, time))
     above = [np.minimum(found.theta + move, high) for move in np.diag(step)]
     below = [np.maximum(found.theta - move, low) for move in np.diag(step)]
-    outputs = fit.regressors(structure, hypothesis, np.array(above + below)) @ c
+    outputs = fit.regressors(structure, hypothesis, np.array(above + below)).dense() @ c
     count = len(found.theta)
     apart = np.array([above[i][i] - below[i][i] for i in range(count)])
     slopes = ((outputs[:count] - outputs[count:]) / apart[:, None]).T

@@ -8,12 +8,13 @@ dominates.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from loopwright.tuning.identification.projection import LocalRegressors, Projection, Rows
+from loopwright.tuning.identification.projection import Projection
+from loopwright.tuning.identification.regressors import Regressors, Rows
 from loopwright.tuning.models import Reals
 
 MAX_TRIES = 12
@@ -65,33 +66,31 @@ class SearchBounds:
 
 
 def descend(
-    columns_of: Callable[[Reals], Reals],
+    regressors_of: Callable[[Reals], Regressors],
     y: Reals,
     starts: Reals,
     bounded: SearchBounds,
     max_steps: int,
     relative_decrease: float,
-    local: Sequence[LocalRegressors] = (),
 ) -> tuple[Reals, Reals]:
     """The local minimum of the sum of squares that each start leads to: (the points, the sums of squares there).
 
-    columns_of: gives the regressors, shape (points, N, columns), at points of shape (points, parameters).
+    regressors_of: gives a set of regressors for each point; points of shape (points, parameters).
     y: the output, shape (N,).
     starts: the starts, shape (starts, parameters).
     bounded: the limits of the search.
     max_steps: the largest number of iterations.
     relative_decrease: a search ends when an iteration lowers its sum of squares by less than this fraction.
-    local: which of the regressors are 0 outside which part of the rows.
     """
     low, high, max_step = bounded.low, bounded.high, bounded.max_step
     at = np.clip(starts, low, high)
-    here = Projection.of(columns_of(at), y, local)
+    here = Projection.of(regressors_of(at), y)
     cost = here.rss
     damping = np.full(len(at), FIRST_DAMPING)
     one = np.eye(at.shape[1])
     going = np.arange(len(at))
     for _ in range(max_steps):
-        slopes = _slopes(columns_of, at, here, going, bounded)
+        slopes = _slopes(regressors_of, at, here, going, bounded)
         turned = np.swapaxes(slopes, 1, 2)
         gradient = (turned @ here.rest[going, :, None])[:, :, 0]
         # a parameter pressed against its bound stays there
@@ -118,7 +117,7 @@ def descend(
             if not len(trying):
                 break
             new = np.clip(at[mine] + np.clip(move / scale[trying], -max_step, max_step), low, high)
-            there = Projection.of(columns_of(new), y, local)
+            there = Projection.of(regressors_of(new), y)
             better = there.rss < cost[mine]
             won = mine[better]
             at[won], cost[won] = new[better], there.rss[better]
@@ -133,15 +132,14 @@ def descend(
 
 
 def _slopes(
-    columns_of: Callable[[Reals], Reals], at: Reals, here: Projection, which: Rows, bounded: SearchBounds
+    regressors_of: Callable[[Reals], Regressors], at: Reals, here: Projection, which: Rows, bounded: SearchBounds
 ) -> Reals:
     """The slopes of the residuals at these points by each parameter, shape (points, N, parameters)."""
     points, count = at[which], at.shape[1]
     signed = np.where(points + bounded.step <= bounded.high, bounded.step, -bounded.step)
     moved = points[:, None, :] + signed[:, :, None] * np.eye(count)
-    columns = columns_of(moved.reshape(-1, count))
-    linear = here.linear[which]
-    answers = np.matmul(columns.reshape(len(points), count, *columns.shape[1:]), linear[:, None, :, None])[..., 0]
+    moved_regressors = regressors_of(moved.reshape(-1, count))
+    answers = moved_regressors.times(np.repeat(here.linear[which], count, axis=0)).reshape(len(points), count, -1)
     change = np.swapaxes((answers - here.fitted(which)[:, None, :]) / signed[:, :, None], 1, 2)
     return -here.beyond(change, which)
 

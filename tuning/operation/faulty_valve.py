@@ -70,24 +70,23 @@ def likeliest_fault(fit: Fit[ExperimentRecord], best: Fitted, parts: Sequence[Hi
     tests, record = ScoreTests(fit, best), fit.record
 
     def scored(fault: Fault, sizes: Reals) -> Iterator[tuple[float, Fault, float]]:
-        for size, u, u_earlier in _positions(record, parts, fault, sizes):
-            yield decrease(u - record.u, u_earlier), fault, size
-
-    def decrease(further: Reals, u_earlier: tuple[Reals, ...]) -> float:
-        before = tuple(each - mv for each, mv in zip(u_earlier, record.u_earlier, strict=True))
-        share, deviation = tests.score(lambda _: further, before)
-        return (2.0 * share - 1.0) / deviation**2
+        for some, u, u_earlier in _positions(record, parts, fault, sizes):
+            before = [each - mv for each, mv in zip(u_earlier, record.u_earlier, strict=True)]
+            shares, deviations = tests.scores(u - record.u, before)
+            for share, deviation, size in zip(shares.tolist(), deviations.tolist(), some.tolist(), strict=True):
+                yield (2.0 * share - 1.0) / deviation**2, fault, size
 
     found: list[tuple[float, Fault, float]] = []
     for fault, ratio in RATIOS.items():
         count = math.ceil(math.log(LARGEST / SMALLEST, ratio))
         found += scored(fault, np.asarray(record.input_range * SMALLEST * ratio ** np.arange(count)))
     near = RATIOS[stiction] ** (np.arange(-FINER, FINER + 1) / FINER)
-    for _, fault, size in heapq.nlargest(BEST, found, key=itemgetter(0)):
-        found += scored(fault, np.asarray(size * near))
+    best_ones = heapq.nlargest(BEST, found, key=itemgetter(0))
+    for fault in RATIOS:
+        found += scored(fault, np.outer([size for _, its, size in best_ones if its is fault], near).ravel())
     largest, fault, size = max(found, key=itemgetter(0))
-    _, u, u_earlier = next(_positions(record, parts, fault, np.array([size])))
-    return FaultyValve(fault, size, largest, u, u_earlier) if largest > 0.0 else None
+    ((_, u, u_earlier),) = _positions(record, parts, fault, np.array([size]))
+    return FaultyValve(fault, size, largest, u[0], tuple(each[0] for each in u_earlier)) if largest > 0.0 else None
 
 
 def models_of_small_faults(
@@ -101,7 +100,9 @@ def models_of_small_faults(
     """
     for fault, sizes in SMALL.items():
         theta = best.theta
-        inputs = [each[1:] for each in _positions(fit.record, parts, fault, fit.record.input_range * np.array(sizes))]
+        inputs: list[tuple[Reals, tuple[Reals, ...]]] = []
+        for some, u, before in _positions(fit.record, parts, fault, fit.record.input_range * np.array(sizes)):
+            inputs += [(u[i], tuple(each[i] for each in before)) for i in range(len(some))]
         if likeliest is not None and likeliest.fault is fault:
             inputs.append((likeliest.u, likeliest.u_earlier))
         for u, u_earlier in inputs:
@@ -114,17 +115,17 @@ def models_of_small_faults(
 
 def _positions(
     record: ExperimentRecord, parts: Sequence[HistoryPart], fault: Fault, sizes: Reals
-) -> Iterator[tuple[float, Reals, tuple[Reals, ...]]]:
-    """Each size with the positions of such a valve in these parts of the record, and before each part; a stretch
-    begins with the valve where MV is."""
+) -> Iterator[tuple[Reals, Reals, list[Reals]]]:
+    """Some of the sizes after others, with the positions of such valves in these parts of the record, shape (sizes, N),
+    and before each part; a stretch begins with the valve where MV is."""
     stretches = {id(each.stretch): each.stretch for each in parts}
     lengths = [*map(len, record.u_earlier)]
-    for some in np.split(sizes, range(TOGETHER, len(sizes), TOGETHER)):
+    for begin in range(0, len(sizes), TOGETHER):
+        some = sizes[begin : begin + TOGETHER]
         followed = {at: followed_by(fault, each.mv - each.mv[0], some) for at, each in stretches.items()}
-        for i, size in enumerate(some.tolist()):
-            of = [(each, followed[id(each.stretch)][i]) for each in parts]
-            u = np.concatenate([each.deviations(position) for each, position in of])
-            yield size, u, tuple(each.deviations_before(at, n) for (each, at), n in zip(of, lengths, strict=True))
+        of = [(each, followed[id(each.stretch)]) for each in parts]
+        u = np.concatenate([each.deviations(positions) for each, positions in of], axis=1)
+        yield some, u, [each.deviations_before(at, n) for (each, at), n in zip(of, lengths, strict=True)]
 
 
 def followed_by(fault: Fault, u: Reals, sizes: Reals) -> Reals:

@@ -85,19 +85,19 @@ class HistoryPart:
     samples: slice
     before: slice
 
-    def deviations(self, column: Reals) -> Reals:
-        """This part of a column of the stretch, less its value before anything moves."""
-        return np.asarray(column[self.samples] - self._rest(column))
+    def deviations(self, columns: Reals) -> Reals:
+        """This part of a column of the stretch, or of several, shape (..., N), less its value before anything moves."""
+        return np.asarray(columns[..., self.samples] - self._rest(columns))
 
-    def deviations_before(self, column: Reals, length: int) -> Reals:
+    def deviations_before(self, columns: Reals, length: int) -> Reals:
         """The deviations of the samples before this part, so many at most."""
         first = self.samples.start
-        return np.asarray(column[max(first - length, 0) : first] - self._rest(column))
+        return np.asarray(columns[..., max(first - length, 0) : first] - self._rest(columns))
 
-    def _rest(self, column: Reals) -> float:
+    def _rest(self, columns: Reals) -> Reals:
         """The value before anything moves, one of those of the column: the deviations keep their resolution."""
-        rest = np.sort(column[self.before])
-        return float(rest[len(rest) // 2])
+        rest = np.sort(columns[..., self.before], axis=-1)
+        return np.asarray(rest[..., rest.shape[-1] // 2, None])
 
 
 def require_operator(stretches: list[Stretch]) -> None:

@@ -75,6 +75,6 @@ def _moved_by(instruments: Fit[ExperimentRecord], found: Fitted) -> Reals:
     """The sensitivities of PV to the parameters of the plant where MV is moved by the set-point alone."""
     inputs = found.structure.inputs
     plant_alone = np.where(np.arange(len(found.linear.coefficients)) < inputs, found.linear.coefficients, 0.0)
-    columns = instruments.regressors(found.structure, found.hypothesis, found.theta[None])[0]
+    columns = instruments.regressors(found.structure, found.hypothesis, found.theta[None]).dense()[0]
     linear = replace(found.linear, coefficients=plant_alone)
     return sensitivities(instruments, replace(found, columns=columns, linear=linear))

@@ -1,33 +1,69 @@
-"""The projection part by part against that of all regressors at once, and against numpy's least squares."""
+"""The projection piece by piece against that of all regressors at once, and against numpy's least squares."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from loopwright.tuning.identification.projection import LocalRegressors, Projection
+from loopwright.tuning.identification.projection import Projection
+from loopwright.tuning.identification.regressors import OwnColumns, PieceRows, Regressors
 from loopwright.tuning.models import Reals
 
-ROWS = [slice(0, 30), slice(30, 75), slice(75, 90)]
-LOCAL = [LocalRegressors(rows, np.array([2 + i, 6 + 2 * i, 7 + 2 * i])) for i, rows in enumerate(ROWS)]
-"""Two common regressors, a level of each part, another common one, and two more regressors of each part."""
-SETS = np.arange(4)
+LENGTHS = {"of one length": (30, 30, 30), "of several lengths": (30, 45, 15)}
+SAMPLES, SETS = 90, np.arange(4)
+COMMON = np.array([0, 1, 5])
+OWN = np.array([[2 + i, 6 + 2 * i, 7 + 2 * i] for i in range(3)])
+"""Two common regressors, a level of each piece, another common one, and two more regressors of each piece."""
 
 
-def regressors(seed: int = 1) -> tuple[Reals, Reals]:
+@pytest.fixture(params=LENGTHS)
+def places(request: pytest.FixtureRequest) -> OwnColumns:
+    return OwnColumns(PieceRows(LENGTHS[request.param]), COMMON, OWN)
+
+
+def regressors(places: OwnColumns, seed: int = 1) -> Regressors:
     random = np.random.default_rng(seed)
-    columns = random.normal(size=(len(SETS), 90, 12))
-    for part in LOCAL:
-        own = columns[:, part.rows, part.columns].copy()
-        columns[:, :, part.columns] = 0.0
-        columns[:, part.rows, part.columns] = own
-    columns[:, :, 0] *= 1e3
-    return columns, random.normal(size=90)
+    rows = places.rows
+    own = random.normal(size=(len(SETS), *rows.inside.shape, OWN.shape[1])) * rows.inside[:, :, None]
+    common = random.normal(size=(len(SETS), SAMPLES, len(COMMON)))
+    common[:, :, 0] *= 1e3
+    return Regressors(common, own, places)
 
 
-def test_coefficients_and_residual_are_those_of_least_squares() -> None:
-    columns, y = regressors()
-    found = Projection.of(columns, y, LOCAL)
+def output() -> Reals:
+    return np.random.default_rng(5).normal(size=SAMPLES)
+
+
+def test_each_regressor_stands_in_its_place_and_in_the_rows_of_its_piece(places: OwnColumns) -> None:
+    given = regressors(places)
+    assert given.own is not None
+    dense = given.dense()
+    assert dense.shape == (len(SETS), SAMPLES, 12)
+    assert np.array_equal(dense[:, :, COMMON], given.common)
+    begin = 0
+    for piece, length in enumerate(places.rows.lengths):
+        mine = dense[:, :, OWN[piece]]
+        assert np.array_equal(mine[:, begin : begin + length], given.own[:, piece, :length])
+        assert not np.any(np.delete(mine, slice(begin, begin + length), axis=1))
+        begin += length
+
+
+def test_signals_are_the_same_after_they_were_a_table(places: OwnColumns) -> None:
+    signals = np.random.default_rng(3).normal(size=(2, SAMPLES, 3))
+    table = places.rows.table(signals)
+    assert np.array_equal(places.rows.record(table), signals)
+    assert not np.any(table[:, ~places.rows.inside])
+    backwards = places.rows.record_of_ends(table[:, :, ::-1])
+    begin = 0
+    for length in places.rows.lengths:
+        assert np.array_equal(backwards[:, begin : begin + length], signals[:, begin : begin + length][:, ::-1])
+        begin += length
+
+
+def test_coefficients_and_residual_are_those_of_least_squares(places: OwnColumns) -> None:
+    given, y = regressors(places), output()
+    columns = given.dense()
+    found = Projection.of(given, y)
     for i in SETS:
         expected, (rss,), *_ = np.linalg.lstsq(columns[i], y, rcond=None)
         assert found.linear[i] == pytest.approx(expected, rel=1e-9, abs=1e-18)
@@ -36,40 +72,56 @@ def test_coefficients_and_residual_are_those_of_least_squares() -> None:
     assert found.fitted(SETS) == pytest.approx(y - found.rest, abs=1e-12)
 
 
-def test_what_is_left_of_a_signal_is_that_of_all_regressors_at_once() -> None:
-    columns, y = regressors()
-    signals = np.random.default_rng(2).normal(size=(2, 90, 3))
+def test_what_is_left_of_a_signal_is_that_of_all_regressors_at_once(places: OwnColumns) -> None:
+    given, y = regressors(places), output()
+    signals = np.random.default_rng(2).normal(size=(2, SAMPLES, 3))
     before = signals.copy()
-    by_parts = Projection.of(columns, y, LOCAL).beyond(signals, SETS[1:3])
-    assert by_parts == pytest.approx(Projection.of(columns, y).beyond(signals, SETS[1:3]), abs=1e-12)
+    by_pieces = Projection.of(given, y).beyond(signals, SETS[1:3])
+    at_once = Projection.of(Regressors(given.dense()), y).beyond(signals, SETS[1:3])
+    assert by_pieces == pytest.approx(at_once, abs=1e-12)
     assert np.array_equal(signals, before)
 
 
-@pytest.mark.parametrize("redundant", [7, 5])
-def test_a_regressor_that_others_make_up_leaves_the_residual(redundant: int) -> None:
-    columns, y = regressors()
-    without = Projection.of(columns, y, LOCAL)
-    columns[:, :, redundant] = 0.0
-    less = Projection.of(columns, y, LOCAL)
-    columns[:, :, redundant] = 2.0 * columns[:, :, 6 if redundant == 7 else 2]
-    again = Projection.of(columns, y, LOCAL)
+@pytest.mark.parametrize("of_piece", [True, False])
+def test_a_regressor_that_others_make_up_leaves_the_residual(places: OwnColumns, of_piece: bool) -> None:
+    given, y = regressors(places), output()
+    assert given.own is not None
+    of_one = given.own[:, 0] if of_piece else given.common
+    without = Projection.of(given, y).rss
+    of_one[:, :, 2] = 0.0
+    less = Projection.of(given, y)
+    of_one[:, :, 2] = 2.0 * of_one[:, :, 1]
+    again = Projection.of(given, y)
+    columns = given.dense()
     for i in SETS:
-        rss = np.linalg.lstsq(np.delete(columns[i], redundant, axis=1), y, rcond=None)[1]
+        others = np.delete(columns[i], OWN[0, 2] if of_piece else COMMON[2], axis=1)
+        rss = np.linalg.lstsq(others, y, rcond=None)[1]
         assert np.isfinite(again.linear).all() and np.isfinite(less.linear).all()
         assert [again.rss[i], less.rss[i]] == pytest.approx([rss[0]] * 2, rel=1e-9)
-        assert again.columns[i] @ again.linear[i] == pytest.approx(again.fitted(SETS)[i], abs=1e-12)
+        assert columns[i] @ again.linear[i] == pytest.approx(again.fitted(SETS)[i], abs=1e-12)
         assert np.sum((y - again.fitted(SETS)[i]) ** 2) == pytest.approx(rss, rel=1e-9)
-    assert (without.rss < again.rss).all()
+    assert (without < again.rss).all()
 
 
-def test_sets_are_replaced_in_all_that_is_known_of_them() -> None:
-    first, y = regressors()
-    second, _ = regressors(3)
-    found, other = Projection.of(first, y, LOCAL), Projection.of(second, y, LOCAL)
+def test_a_piece_of_fewer_rows_than_regressors_is_explained_whole() -> None:
+    places = OwnColumns(PieceRows((40, 2, 48)), COMMON, OWN)
+    given, y = regressors(places), output()
+    found = Projection.of(given, y)
+    for i, columns in enumerate(given.dense()):
+        expected = np.linalg.lstsq(columns, y, rcond=None)[0]
+        assert found.rest[i] == pytest.approx(y - columns @ expected, abs=1e-11)
+        assert found.rest[i, 40:42] == pytest.approx([0.0, 0.0], abs=1e-11)
+
+
+def test_sets_are_replaced_in_all_that_is_known_of_them(places: OwnColumns) -> None:
+    first, second, y = regressors(places), regressors(places, 3), output()
+    found, other = Projection.of(regressors(places), y), Projection.of(second, y)
     better = np.array([False, True, False, True])
     found.replace(SETS[better], other, better)
-    expected = Projection.of(np.where(better[:, None, None], second, first), y, LOCAL)
-    signals = np.random.default_rng(4).normal(size=(4, 90, 2))
-    assert found.rss == pytest.approx(expected.rss, rel=1e-12)
-    assert found.beyond(signals, SETS) == pytest.approx(expected.beyond(signals, SETS), abs=1e-12)
-    assert found.fitted(SETS) == pytest.approx(expected.fitted(SETS), abs=1e-9)
+    signals = np.random.default_rng(4).normal(size=(4, SAMPLES, 2))
+    expected = [Projection.of(each, y) for each in (first, second)]
+    for i in SETS:
+        of = expected[int(better[i])]
+        assert found.rss[i] == pytest.approx(of.rss[i], rel=1e-12)
+        assert found.beyond(signals, SETS)[i] == pytest.approx(of.beyond(signals, SETS)[i], abs=1e-12)
+        assert found.fitted(SETS)[i] == pytest.approx(of.fitted(SETS)[i], abs=1e-9)

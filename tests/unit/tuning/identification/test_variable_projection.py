@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from loopwright.tuning.identification.regressors import Regressors
 from loopwright.tuning.identification.variable_projection import SearchBounds, covariance, descend, solve
 from loopwright.tuning.models import Reals
 
@@ -24,10 +25,10 @@ def measured() -> Reals:
 def descended(y: Reals, starts: list[list[float]], high: float, steps: int = 60) -> tuple[Reals, Reals]:
     bounded = SearchBounds(np.full(2, -6.0), np.full(2, high), np.full(2, 1.5), np.full(2, 1e-6))
 
-    def columns(thetas: Reals) -> Reals:
-        return np.array([two_exponentials(theta) for theta in thetas])
+    def regressors(thetas: Reals) -> Regressors:
+        return Regressors(np.array([two_exponentials(theta) for theta in thetas]))
 
-    return descend(columns, y, np.array(starts), bounded, steps, 1e-7)
+    return descend(regressors, y, np.array(starts), bounded, steps, 1e-7)
 
 
 def test_the_same_minimum_as_with_all_parameters_searched() -> None:
@@ -59,11 +60,11 @@ def test_starts_side_by_side_go_where_each_goes_alone() -> None:
 def test_a_parameter_that_does_nothing_stays() -> None:
     y = measured()
 
-    def columns(thetas: Reals) -> Reals:
-        return np.array([two_exponentials(theta[:2]) for theta in thetas])
+    def regressors(thetas: Reals) -> Regressors:
+        return Regressors(np.array([two_exponentials(theta[:2]) for theta in thetas]))
 
     bounded = SearchBounds(np.full(3, -6.0), np.full(3, 6.0), np.full(3, 1.5), np.full(3, 1e-6))
-    found, rss = descend(columns, y, np.array([[-1.5, 2.0, 0.7]]), bounded, 60, 1e-7)
+    found, rss = descend(regressors, y, np.array([[-1.5, 2.0, 0.7]]), bounded, 60, 1e-7)
     expected, minimum = descended(y, [[-1.5, 2.0]], 6.0)
     assert found[0, 2] == 0.7
     assert found[0, :2] == pytest.approx(expected[0], abs=1e-6) and rss == pytest.approx(minimum, rel=1e-9)

@@ -85,7 +85,7 @@ def test_a_load_disturbance_ends_with_the_piece_that_it_begins_in() -> None:
     at = LENGTHS[0] + 40.0
     theta = np.array([np.log(1.0 / T1 + 1.0 / T2), np.log(1.0 / (T1 * T2)), DELAY, at])
     hypothesis = DisturbanceHypothesis(load_disturbances=1)
-    columns = fit.regressors(SECOND, hypothesis, theta[None])[0]
+    columns = fit.regressors(SECOND, hypothesis, theta[None]).dense()[0]
     first = fit.first_load(SECOND, hypothesis)
     moved = np.flatnonzero(np.any(columns[:, first : first + SECOND.order] != 0.0, axis=1))
     assert LENGTHS[0] + 40 <= moved[0] <= LENGTHS[0] + 42
@@ -95,7 +95,7 @@ def test_a_load_disturbance_ends_with_the_piece_that_it_begins_in() -> None:
 def test_levels_and_starts_belong_to_one_piece_each() -> None:
     fit = Fit(record())
     theta = np.array([[np.log(1.0 / T1), DELAY]])
-    columns = fit.regressors(FIRST, UNDISTURBED, theta)[0]
+    columns = fit.regressors(FIRST, UNDISTURBED, theta).dense()[0]
     assert columns.shape == (sum(LENGTHS), 1 + 3 + 3)
     for i, rows in enumerate(fit.rows):
         for column in (columns[:, 1 + i], columns[:, 4 + i]):
@@ -110,28 +110,24 @@ def test_what_belongs_to_one_piece_is_known_under_every_hypothesis(loads: int, d
     fit = Fit(record())
     hypothesis = DisturbanceHypothesis(load_disturbances=loads, drift=drift)
     theta = np.array([np.log(1.0 / T1 + 1.0 / T2), np.log(1.0 / (T1 * T2)), DELAY, *[LENGTHS[0] + 40.0] * loads])
-    columns = fit.regressors(SECOND, hypothesis, theta[None])[0]
-    local = fit.local_regressors(SECOND, hypothesis)
-    assert [each.rows for each in local] == fit.rows
-    assert all(len(each.columns) == 1 + drift + SECOND.order for each in local)
-    for each in local:
-        outside = np.delete(columns[:, each.columns], each.rows, axis=0)
-        assert np.all(outside == 0.0) and np.all(np.any(columns[:, each.columns] != 0.0, axis=0))
-    common = np.setdiff1d(np.arange(columns.shape[1]), np.concatenate([each.columns for each in local]))
+    found = fit.regressors(SECOND, hypothesis, theta[None])
+    columns, places = found.dense()[0], fit.places(SECOND, hypothesis)
+    assert places.own.shape == (len(LENGTHS), 1 + drift + SECOND.order)
+    for rows, own in zip(fit.rows, places.own, strict=True):
+        outside = np.delete(columns[:, own], rows, axis=0)
+        assert np.all(outside == 0.0) and np.all(np.any(columns[:, own] != 0.0, axis=0))
     first = fit.first_load(SECOND, hypothesis)
     expected = [*range(SECOND.inputs), *range(first, first + SECOND.order * loads)]
-    assert common.tolist() == expected
+    assert places.common.tolist() == expected
+    assert sorted([*places.common, *places.own.ravel()]) == list(range(columns.shape[1]))
 
 
-def test_a_piece_of_fewer_samples_than_regressors_is_projected_out_with_the_common_ones() -> None:
+def test_a_piece_of_fewer_samples_than_regressors_is_explained_whole() -> None:
     whole = record()
-    short = replace(whole, u=whole.u[:503], y=whole.y[:503], excited=503, lengths=(300, 3, 200))
-    fit = Fit(short)
-    local = fit.local_regressors(SECOND, UNDISTURBED)
-    assert [each.rows for each in local] == [slice(0, 300), slice(303, 503)]
+    fit = Fit(replace(whole, u=whole.u[:503], y=whole.y[:503], excited=503, lengths=(300, 3, 200)))
     theta = np.array([np.log(1.0 / T1 + 1.0 / T2), np.log(1.0 / (T1 * T2)), DELAY])
     found = fit.fitted(SECOND, UNDISTURBED, theta)
-    projected = Projection.of(found.columns[None], fit.y, local)
+    projected = Projection.of(fit.regressors(SECOND, UNDISTURBED, theta[None]), fit.y)
     assert projected.rest[0] == pytest.approx(found.linear.residual, abs=1e-9)
 
 
