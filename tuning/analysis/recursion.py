@@ -43,10 +43,11 @@ def public_filter() -> Filter:
     return lambda b, a, x: np.asarray(lfilter(b, a, x))
 
 
+_ONE = np.ones(1)
 _filter = compiled_filter() or public_filter()  # as this module is imported, and not in the middle of a test
 
 
 def recursive(recursion: Reals, u: Reals) -> Reals:
     """The solution y of recursion[0] y[n] + recursion[1] y[n-1] + ... = u[n], at rest before n = 0; u, y: shape
     (..., N)."""
-    return _filter(np.ones(1), recursion, u)
+    return _filter(_ONE, recursion, u)

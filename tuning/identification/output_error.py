@@ -199,7 +199,8 @@ class Fit(Generic[S]):
             # a step of every state at the start represents any initial state, and a load disturbance
             times = np.append(times, np.zeros((1, many)), axis=0)
         loads = len(times) - 1 - free
-        answers = pulses(np.tile(structure.monic(thetas), (len(times), 1)), times.ravel(), order)
+        monic = structure.monic(thetas)
+        answers = pulses(np.tile(monic, (len(times), 1)) if len(times) > 1 else monic, times.ravel(), order)
         driven = answers.of(slice(many))
         given = [self._of_last_samples(driven.drive(self._driving, inputs))]
         if structure.feed_through:
@@ -217,9 +218,18 @@ class Fit(Generic[S]):
                 self._end_with_piece(load, times_of_load)
             own = self._own(hypothesis, started[:, : self._of_pieces.longest])
             return Regressors(np.concatenate((*given, *loaded), axis=2), own, self.places(structure, hypothesis))
-        always = [np.broadcast_to(1.0, (many, self.samples, 1))]
-        always += [np.broadcast_to(self._ramps[0, :, None], (many, self.samples, 1))] if hypothesis.drift else []
-        return Regressors(np.concatenate((*given, *always, *loaded, *([started] if free else [])), axis=2))
+        first = self.first_load(structure, hypothesis)
+        out = np.empty((many, self.samples, first + order * (loads + free)))
+        at = 0
+        for columns in given:
+            out[:, :, at : at + columns.shape[2]] = columns
+            at += columns.shape[2]
+        out[:, :, at] = 1.0
+        if hypothesis.drift:
+            out[:, :, at + 1] = self._ramps[0]
+        for k, columns in enumerate((*loaded, started)[: loads + free]):
+            out[:, :, first + order * k : first + order * (k + 1)] = columns
+        return Regressors(out)
 
     def _own(self, hypothesis: DisturbanceHypothesis, started: Reals) -> Reals:
         """The level, the slope where PV drifts, and the start of each of several pieces, as `Regressors.own`."""

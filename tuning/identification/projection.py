@@ -41,7 +41,8 @@ class Projection:
         """The projection of y, shape (N,), on each set."""
         lengths = _lengths(regressors.common)
         common = regressors.common / lengths[:, None]
-        rest = np.tile(y[:, None], (len(common), 1, 1))
+        rest = np.empty((len(common), len(y), 1))
+        rest[:, :, 0] = y
         if regressors.own is None or regressors.places is None:
             factors = _Factors.of(common)
             linear = factors.coefficients(_take_out(factors.basis, rest))[:, :, 0]
