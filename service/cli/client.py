@@ -19,6 +19,9 @@ KEY_VARIABLE = "LOOPWRIGHT_KEY"
 """The key is in the environment, because every user of the machine can read a command line."""
 _PATIENCE_S = 30.0
 """Longest wait for an answer, also to a request that is repeated because its connection broke, wall time, s."""
+_COMPUTED_PATIENCE_S = 300.0
+"""Longest wait for an answer that the service computes when it is asked for, wall time, s. It takes seconds, and longer
+where the processors are slow or tests have them first."""
 _SILENT_S = 15.0
 """Wall time after which a live stream that says nothing counts as cut off, s; it speaks about once a second."""
 _AGAIN_S = 2.0
@@ -46,7 +49,11 @@ class Client:
 
     def get(self, path: str, **query: str | float | None) -> object:
         """Returns the JSON of the answer; a query of None is left out."""
-        return _json(self._answer("GET", path, {k: v for k, v in query.items() if v is not None}))
+        return _json(self._answer("GET", path, _given(query)))
+
+    def computed(self, path: str, **query: str | float | None) -> object:
+        """As `get`, for an answer that the service computes when it is asked for, which is waited for longer."""
+        return _json(self._answer("GET", path, _given(query), _COMPUTED_PATIENCE_S))
 
     def file(self, path: str) -> tuple[str, str]:
         """Returns the file name that the service gives to a text, and the text."""
@@ -144,9 +151,13 @@ class Client:
             time.sleep(_AGAIN_S)
 
     def _answer(
-        self, method: str, path: str | httpx.URL, query: Mapping[str, str | float] | None = None
+        self,
+        method: str,
+        path: str | httpx.URL,
+        query: Mapping[str, str | float] | None = None,
+        patience_s: float = _PATIENCE_S,
     ) -> httpx.Response:
-        answer = self._send(method, path, query)
+        answer = self._send(method, path, query, patience_s=patience_s)
         self._check(answer)
         return answer
 
@@ -157,22 +168,26 @@ class Client:
         query: Mapping[str, str | float] | None = None,
         body: Mapping[str, object] | None = None,
         headers: Mapping[str, str] | None = None,
+        patience_s: float = _PATIENCE_S,
     ) -> httpx.Response:
         import httpx
 
         try:
-            return self._http.request(method, path, params=query, json=body, headers=headers)
+            timeout = httpx.Timeout(_PATIENCE_S, read=patience_s)
+            return self._http.request(method, path, params=query, json=body, headers=headers, timeout=timeout)
         except httpx.TransportError as error:
             carried_out = "" if method == "GET" else "\n" + _PERHAPS_CARRIED_OUT
-            raise self._no_answer(error, f"{method} {path}", carried_out) from error
+            raise self._no_answer(error, f"{method} {path}", carried_out, patience_s) from error
 
-    def _no_answer(self, error: httpx.TransportError, asked: str, carried_out: str = "") -> ApiError:
+    def _no_answer(
+        self, error: httpx.TransportError, asked: str, carried_out: str = "", patience_s: float = _PATIENCE_S
+    ) -> ApiError:
         import httpx
 
         if isinstance(error, httpx.ConnectError):
             why = f"no service at {self.url} ({error}); start one with: loopwright serve"
         elif isinstance(error, httpx.TimeoutException):
-            why = f"the service at {self.url} has not answered {asked} within {_PATIENCE_S:g} s; its log says why"
+            why = f"the service at {self.url} has not answered {asked} within {patience_s:g} s; its log says why"
         else:
             why = f"the service at {self.url} broke the connection at {asked} ({error}); its log says why"
         return ApiError(why + carried_out)
@@ -190,6 +205,10 @@ class Client:
             body["advice"] = f"Put an API key into the environment variable {KEY_VARIABLE}."
         lines = [body.get("detail") or body.get("title"), body.get("advice"), body.get("job")]
         raise ApiError("\n".join(line for line in lines if line))
+
+
+def _given(query: Mapping[str, str | float | None]) -> dict[str, str | float]:
+    return {name: value for name, value in query.items() if value is not None}
 
 
 def _events_of(answer: httpx.Response) -> Iterator[dict[str, str]]:

@@ -141,7 +141,7 @@ def observe(
     from loopwright.service.observing.observed import ObservationState, ObservationView
 
     path = f"/loops/{quote(tag, safe='')}/observation"
-    found = Client(url).get(
+    found = Client(url).computed(
         path, ms=ms, derivative=str(derivative).lower(), aim=aim, settling_s=settling_s, mv_peak=mv_peak,
         noise_gain=noise_gain,
     )  # fmt: skip

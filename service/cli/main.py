@@ -387,7 +387,7 @@ def _other_gains(
 
     wanted = str(derivative).lower() if ms is not None else None
     found = AlternativesView.model_validate(
-        client.get(f"{jobs.path_of(client, job)}/alternatives", ms=ms, derivative=wanted, method=method, **options)
+        client.computed(f"{jobs.path_of(client, job)}/alternatives", ms=ms, derivative=wanted, method=method, **options)
     )
     if found.loop != loop:
         die(f"job {found.job} is of loop {found.loop}, not of {loop}", 2)

@@ -95,6 +95,16 @@ def test_a_service_that_is_there_is_not_said_to_be_missing(
     assert "no service" not in str(raised.value) and "carried out" not in str(raised.value)
 
 
+def test_what_the_service_computes_is_waited_for_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    client, sent = through(monkeypatch, *(httpx.Response(200, json={}) for _ in range(2)), httpx.ReadTimeout("late"))
+    client.get("/loops")
+    client.computed("/loops/TIC-101/observation", ms=1.4, aim=None)
+    assert [each.extensions["timeout"]["read"] for each in sent] == [30.0, 300.0]
+    assert sent[1].extensions["timeout"]["connect"] == 30.0 and sent[1].url.query == b"ms=1.4"
+    with pytest.raises(ApiError, match="has not answered GET /loops/TIC-101/observation within 300 s"):
+        client.computed("/loops/TIC-101/observation")
+
+
 def test_what_is_still_being_answered_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     client, sent = through(monkeypatch, httpx.ReadError("reset"), busy(), busy(), httpx.Response(200, json={"id": "x"}))
     assert client.post("/jobs/x/accept") == {"id": "x"}
