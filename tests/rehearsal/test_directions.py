@@ -25,7 +25,6 @@ from loopwright.tuning.fast.setpoint_procedure import setpoint
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.plan import Mode, Sample
-from loopwright.tuning.reasons import Reason
 from tests.rehearsal.test_excitation_choice import Heard
 from tests.rehearsal.test_fast import PLANTS, true_Ms
 from tests.rehearsal.test_setpoint import ultimate, under
@@ -107,20 +106,14 @@ def test_a_gain_that_differs_below_is_refused_where_MV_goes_there(below: float, 
     assert of_two_sided(below, directions).value is None
 
 
-def test_where_MV_hardly_goes_there_the_gains_hold_for_the_side_that_was_tested() -> None:
-    """Whether the difference shows is a matter of the noise, and in a close case of the processor."""
-    proposed = 0
-    for Ti, seed in ((12.0, 2), (12.0, 6), (20.0, 3)):
-        made = of_two_sided(0.7, Directions.UP, 0.25, Ti, seed)
-        if made.value is None:
-            assert made.ended is not None and made.ended.reason in (Reason.UNEXPLAINED, Reason.MODEL_MISMATCH)
-            continue
-        proposed += 1
-        assert any(UNSEEN in note for note in made.value.notes)
-        above, below = (margins(FOPDT(K, 10.0, 2.0 + 0.05), made.value.gains).Ms for K in (2.0, 1.4))
-        assert above == pytest.approx(1.6, abs=0.05)
-        assert below < 1.5, "another one, which the test cannot know"
-    assert proposed
+@pytest.mark.parametrize("seed", [2, 6])
+def test_where_MV_hardly_goes_there_the_gains_hold_for_the_side_that_was_tested(seed: int) -> None:
+    """Under other noise the difference shows and is refused. With these seeds it does not, whatever is rounded."""
+    found = of_two_sided(0.7, Directions.UP, 0.25, 12.0, seed).value
+    assert found is not None and any(UNSEEN in note for note in found.notes)
+    above, below = (margins(FOPDT(K, 10.0, 2.0 + 0.05), found.gains).Ms for K in (2.0, 1.4))
+    assert above == pytest.approx(1.6, abs=0.05)
+    assert below < 1.5, "another one, which the test cannot know"
 
 
 class TestRefused:
