@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from loopwright.tuning.fast.design import DesignSpec
@@ -41,6 +42,16 @@ def test_a_linear_plant_is_not_told_to_be_another(name: str, seed: int) -> None:
         assert abs(size) < 4.0 * deviation
 
 
+def test_many_alternatives_at_once_are_each_as_alone() -> None:
+    given = pulse_record(*LOOPS["three lags"], noise=0.01)
+    fit = Fit(given)
+    tests = ScoreTests(fit, choose_structure(fit).best)
+    changes = (above_rest, squared, fading, late(20))
+    sizes, deviations = tests.scores(np.array([each(given) for each in changes]))
+    alone = np.array([tests.score(each) for each in changes])
+    assert np.column_stack((sizes, deviations)) == pytest.approx(alone, rel=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("bench", [FIRST, THREE_LAGS])
 def test_a_linear_plant_under_a_relay_is_not_told_to_be_another(bench: Bench, seed: int) -> None:
@@ -56,17 +67,16 @@ def test_a_relay_alone_gives_no_gains_where_the_gain_differs_above_and_below_res
     assert found.reason in (Reason.UNCERTAIN, Reason.UNEXPLAINED)
 
 
-@pytest.mark.parametrize("below", [0.5, 0.7, 1.4, 2.0])
+@pytest.mark.parametrize("below", [0.5, 0.6, 0.7, 1.4, 2.0])
 @pytest.mark.parametrize("name", LOOPS)
 def test_a_gain_that_differs_above_and_below_rest_is_no_evidence(name: str, below: float) -> None:
     """Load disturbances can stand for a part of the difference: the record is then called uncertain, and goes on."""
     evaluation = evaluate(pulse_record(*LOOPS[name], noise=0.005, below=below), DesignSpec(1.6))
     assert evaluation.reason is not None
     size, deviation = ScoreTests(evaluation.fit, evaluation.chosen.best).score(above_rest)
-    if (name, below) == ("first order", 0.7):  # 0.1 +- 0.6 or 0.16 +- 0.25, by the processor: the sign is chance
-        assert abs(size) < 2.0 * deviation
-    else:
-        assert (size > 0.0) == (below < 1.0) and deviation > 0.0
+    assert deviation > 0.0
+    if (name, below) != ("first order", 0.7):  # there rounding errors decide: -0.03 +- 0.29 to 0.19 +- 0.23
+        assert (size > 0.0) == (below < 1.0)
 
 
 def test_the_size_is_that_of_the_plant() -> None:
