@@ -12,7 +12,8 @@ _EACH = 3
 _COEFFICIENTS = np.array(
     [[1.0 / math.factorial(_EACH * j + i) if i < _EACH or j == 3 else 0.0 for i in range(_EACH + 1)] for j in range(4)]
 )
-"""Of Taylor's series to the degree 12: row j is multiplied by the power 3*j of the matrix, column i by its power i."""
+"""The coefficients of Taylor's series to the degree 12; row j belongs to the power 3*j of the matrix, column i to its
+power i."""
 
 
 def exponentials(matrices: Reals) -> Reals:
