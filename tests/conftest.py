@@ -15,6 +15,7 @@ import pytest
 from hypothesis import settings
 
 from loopwright.service.cli.demo import vcan_usable
+from tests.browser import CHROMIUM
 
 settings.register_profile("untimed", settings.default, deadline=None)  # a busy machine makes any test slow
 settings.load_profile("untimed")
@@ -36,12 +37,20 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--all-on-vcan", action="store_true", help="over vcan0 too whatever goes over the hub")
+    parser.addoption("--each-once", action="store_true", help="not over the hub what the mark on_vcan names for vcan0")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Marks what may fail where processes start slowly: `python -m tests.repeat` repeats it beside a load."""
-    if not config.getoption("--all-on-vcan"):
-        left_out = [item for item in items if isinstance(item, pytest.Function) and _by_hub_alone(item)]
+    by_default, each_once = not config.getoption("--all-on-vcan"), config.getoption("--each-once")
+    left_out = [
+        item
+        for item in items
+        if isinstance(item, pytest.Function)
+        and (chosen := item.get_closest_marker("on_vcan")) is not None
+        and _is_left_out(item, chosen, by_default, each_once)
+    ]
+    if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in left_out]
     for item in items:
@@ -63,19 +72,19 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         if os.environ.get("LOOPWRIGHT_REQUIRE_VCAN"):
             pytest.fail("no vcan0")
         pytest.skip("no vcan0: run under tools/with-vcan")
-    if item.get_closest_marker("browser") and not shutil.which("chromium"):
+    if item.get_closest_marker("browser") and not shutil.which(CHROMIUM):
         if os.environ.get("LOOPWRIGHT_REQUIRE_BROWSER"):
-            pytest.fail("no chromium")
-        pytest.skip("no chromium: the Debian package of that name has it")
+            pytest.fail(f"no {CHROMIUM}")
+        pytest.skip(f"no {CHROMIUM}: the Debian package of that name has it")
 
 
-def _by_hub_alone(item: pytest.Function) -> bool:
-    """Whether this is a test over vcan0 whose parameters are not among those of its mark on_vcan: user-mode Linux takes
-    several times as long for each system call as the hub does."""
-    chosen = item.get_closest_marker("on_vcan")
-    if chosen is None or item.get_closest_marker("vcan") is None:
-        return False
-    return not set(item.callspec.params.values()) & set(chosen.args)
+def _is_left_out(item: pytest.Function, chosen: pytest.Mark, by_default: bool, each_once: bool) -> bool:
+    """Whether a test with the mark on_vcan is left out over its bus: over vcan0 one whose parameters the mark does not
+    name (user-mode Linux takes several times as long for each system call as the hub does); over the hub, where each
+    runs once, one that it names."""
+    named = bool(set(item.callspec.params.values()) & set(chosen.args))
+    over_vcan = item.get_closest_marker("vcan") is not None
+    return (by_default and not named) if over_vcan else (each_once and named)
 
 
 @cache

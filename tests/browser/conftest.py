@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from tests.browser import CHROMIUM
 from tests.browser.pages import Pages
 from tests.browser.site import Site
 
@@ -48,7 +49,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
 def browser() -> Iterator[Browser]:
     """Debian's Chromium."""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=OPTIONS)
+        browser = playwright.chromium.launch(executable_path=shutil.which(CHROMIUM), args=OPTIONS)
         yield browser
         browser.close()
 
@@ -61,10 +62,11 @@ def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
 
 
 @pytest.fixture
-def site(processes: Site) -> Site:
+def site(processes: Site) -> Iterator[Site]:
     """The shared processes, the loop at rest on its old gains, the plant at PACE."""
     processes.at_rest(PACE)
-    return processes
+    yield processes
+    processes.left_alone()
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from typing import Any, cast
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-from tests.browser import person
+from tests.browser import CHROMIUM, person
 from tests.browser.conftest import OPTIONS
 from tests.browser.fleet import Fleet, Member, locked_service
 from tests.browser.pages import PATIENCE_MS
@@ -200,7 +200,7 @@ def main() -> None:
     options.folder.mkdir(parents=True, exist_ok=True)
     with sync_playwright() as playwright, ExitStack() as stack:
         work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=OPTIONS)
+        browser = playwright.chromium.launch(executable_path=shutil.which(CHROMIUM), args=OPTIONS)
         stack.callback(browser.close)
         locked = locked_service(stack, work)
         fleet = Fleet(stack, work, FLEET, ts=0.1)

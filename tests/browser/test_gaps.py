@@ -26,6 +26,7 @@ PATIENCE_S = 60.0
 WINDOW_S = 30.0
 MIN_COLUMNS = 150
 """Of the trend's 1,000: 4.5 s of 30 s, 37 columns of the trend of 2 min."""
+LOOK_MS = 100.0
 AGE = re.compile(r"^\d.* old$")
 SHORT_S = 1.5
 """Shorter than the silence after which values count as old."""
@@ -52,7 +53,7 @@ def until(page: Page, seen: Callable[[], bool]) -> None:
     give_up = time.monotonic() + PATIENCE_S
     while not seen():
         assert time.monotonic() < give_up, trend.columns(page)
-        page.evaluate("new Promise(requestAnimationFrame)")
+        page.wait_for_timeout(LOOK_MS)  # each look reads the whole canvas
 
 
 def empty_at_the_right(page: Page) -> float:

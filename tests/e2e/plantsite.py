@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -14,8 +14,9 @@ import httpx
 import pytest
 import yaml
 
+from loopwright.protocol.bus import BusError
 from loopwright.protocol.profile import FOREVER
-from loopwright.protocol.tuner import Tuner
+from loopwright.protocol.tuner import Tuner, TunerError
 from loopwright.service.cli.child_process import ChildProcess
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.service.states.loop_state import LoopState
@@ -89,6 +90,7 @@ STAGES = {
 }
 """Of model 14. Those of a loop in manual need a site of which `MANUAL_PERMITTED` permits them."""
 MANUAL_PERMITTED: Mapping[str, object] = MappingProxyType({"test": {"excitations": ["relay", "manual"]}})
+LEFT_ALONE_PACE = 0.1
 RESTED = 0.25
 """Part of an ultimate period after a pulse of the manual output from which on PV is left to itself."""
 
@@ -201,9 +203,15 @@ class Plantsite:
             state = self.state()
             assert time.monotonic() < deadline, state
             near = near + 1 if abs(state.pv - self.case.sp) < 2e-4 else 0
-            time.sleep(0.1)
+            time.sleep(0.02)  # some seconds of the plant, which runs as fast as it can
         self.write("plant_pace", pace)
         assert self.is_home()
+
+    def left_alone(self) -> None:
+        """Until the next `at_rest` nobody looks, so the plant hardly samples: at ten times real time the five processes
+        take more than half a processor. What a test has ended does not answer, and has stopped anyway."""
+        with suppress(TunerError, BusError):
+            self.write("plant_pace", LEFT_ALONE_PACE, tries=3)
 
     def put_in_manual(self) -> None:
         """Where MV is."""
@@ -258,9 +266,9 @@ class Plantsite:
         return job
 
     def until(
-        self, url: str, wanted: Callable[[dict[str, Any]], bool], patience_s: float = 200.0, every_s: float = 0.05
+        self, url: str, wanted: Callable[[dict[str, Any]], bool], patience_s: float = 200.0, every_s: float = 0.1
     ) -> dict[str, Any]:
-        """Each look takes some ms of processor time, in user-mode Linux many times that."""
+        """Each look takes some 10 ms of processor time, in user-mode Linux many times that."""
         deadline = time.monotonic() + patience_s
         while time.monotonic() < deadline:
             job = self.job(url)
@@ -271,7 +279,7 @@ class Plantsite:
         raise AssertionError(f"still {job}")
 
     def finished(self, url: str, patience_s: float = 200.0) -> dict[str, Any]:
-        return self.until(url, lambda job: job["state"] not in ("queued", "running"), patience_s, every_s=0.25)
+        return self.until(url, lambda job: job["state"] not in ("queued", "running"), patience_s, every_s=0.4)
 
     def until_watched(
         self, url: str, wanted: Callable[[dict[str, Any]], bool], patience_s: float = 200.0
@@ -298,9 +306,9 @@ class Plantsite:
         finally:
             tuner.close()
 
-    def write(self, name: str, value: float) -> None:
+    def write(self, name: str, value: float, tries: int = 20) -> None:
         """By SDO, as somebody else on the bus would, who waits for a busy machine."""
-        tuner = Tuner(self.bus, 0x20, 0x10, sdo_tries=20)
+        tuner = Tuner(self.bus, 0x20, 0x10, sdo_tries=tries)
         try:
             tuner.write(name, value)
         finally:

@@ -67,6 +67,7 @@ def ended(here: Plantsite, url: str) -> tuple[str, str]:
     return job["state"], job["reason"]
 
 
+@pytest.mark.on_vcan("fast")
 def test_a_foreign_setpoint_stays(here: Plantsite, early: Stage) -> None:
     url = here.in_stage(early)
     here.write("controller_setpoint", 50.03)
@@ -74,6 +75,7 @@ def test_a_foreign_setpoint_stays(here: Plantsite, early: Stage) -> None:
     assert here.is_home(sp=50.03)
 
 
+@pytest.mark.on_vcan("fast")
 def test_a_mode_changed_by_another(here: Plantsite, early: Stage) -> None:
     url = here.in_stage(early)
     here.write("controller_mode_command", Mode.MANUAL)
@@ -86,18 +88,21 @@ def test_a_mode_changed_by_another(here: Plantsite, early: Stage) -> None:
     assert here.is_home()
 
 
+@pytest.mark.on_vcan("fast")
 def test_pv_at_its_limit(here: Plantsite, early: Stage) -> None:
     narrow = {"pv_high": 50.05, "sp_deviation": 0.04}  # the step itself stays within them
     assert ended(here, here.retune(**narrow, **early.options)) == ("failed", "pv_limit")
     assert here.is_home()
 
 
+@pytest.mark.on_vcan("fast")
 def test_noise_too_high(here: Plantsite, early: Stage) -> None:
     here.write("plant_noise", 0.05)
     assert ended(here, here.retune(**early.options)) == ("refused", "noise_too_high")
     assert here.is_home()
 
 
+@pytest.mark.on_vcan("fast")
 def test_not_at_rest(here: Plantsite, early: Stage) -> None:
     """One load would die away, and the loop would be looked at again: this one comes again and again."""
     url = here.retune(**early.options)
@@ -116,6 +121,7 @@ def test_not_at_rest(here: Plantsite, early: Stage) -> None:
     assert here.is_home()
 
 
+@pytest.mark.on_vcan("fast")
 def test_mv_without_room(here: Plantsite, early: Stage) -> None:
     assert ended(here, here.retune(mv_low=49.9, mv_high=60, **early.options)) == ("refused", "saturated")
     assert here.is_home()
@@ -150,6 +156,7 @@ def test_nan_by_sdo_is_refused_and_the_loop_goes_on(here: Plantsite) -> None:
     assert here.read("sample_number") > before and here.state().pv == pytest.approx(50.0, abs=1e-3)
 
 
+@pytest.mark.on_vcan("fast")
 def test_a_plant_that_falls_silent(here: Plantsite, early: Stage) -> None:
     url = here.in_stage(early)
     os.kill(here.plant.pid, signal.SIGSTOP)

@@ -67,9 +67,16 @@ EXPECTED: dict[tuple[str, str], tuple[str, ...]] = {
 
 
 @pytest.fixture(scope="module")
-def stands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[Needs, Stand]]:
+def all_stands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[Needs, Stand]]:
     with ExitStack() as stack:
         yield _Stands(stack, tmp_path_factory)
+
+
+@pytest.fixture
+def stands(all_stands: dict[Needs, Stand]) -> Iterator[dict[Needs, Stand]]:
+    yield all_stands
+    for stand in all_stands.values():
+        stand.left_alone()
 
 
 class _Stands(dict[Needs, Stand]):

@@ -24,17 +24,18 @@ def run(todo: Sequence[tuple[str, int]], processes: int) -> Iterator[Ending]:
         yield from pool.map(_play, todo, chunksize=_CHUNK)
 
 
-def every_call(restarts_s: tuple[float, ...], processes: int, in_turn: bool = False) -> Iterator[Ending]:
-    """The job that does everything, killed at each of its calls of the bus. in_turn: each call with one restart."""
+def every_call(restarts_s: tuple[float, ...], processes: int, that_differ: bool = False) -> Iterator[Ending]:
+    """The job that does everything, killed at each of its calls of the bus. that_differ: at those alone before which
+    something was sent or stored, each with one restart."""
     with ProcessPoolExecutor(processes, get_context("fork"), begin) as pool:
-        todo = pool.submit(_todo, restarts_s).result()
-        if in_turn:
+        todo = pool.submit(_todo, restarts_s, that_differ).result()
+        if that_differ:
             todo = [todo[at + at // len(restarts_s) % len(restarts_s)] for at in range(0, len(todo), len(restarts_s))]
         yield from pool.map(every_call_of_one_job.play, todo, chunksize=_CHUNK)
 
 
-def _todo(restarts_s: tuple[float, ...]) -> list[tuple[int, float]]:
-    return list(every_call_of_one_job.todo(restarts_s))
+def _todo(restarts_s: tuple[float, ...], that_differ: bool) -> list[tuple[int, float]]:
+    return list(every_call_of_one_job.todo(restarts_s, that_differ))
 
 
 def begin() -> None:
