@@ -39,13 +39,10 @@ def largest_gains(g: Complexes, Ms: float, Mt: float | None = None, maximum: flo
         intervals.append(_forbidden(g, 1.0, room))
     low, high = np.concatenate(intervals, axis=1)
     order = np.argsort(low)
-    found: list[float] = []
-    covered = 0.0
-    for a, b in zip(low[order], high[order], strict=True):
-        if a > covered and maximum > covered:
-            found.append(min(float(a), maximum))
-        covered = max(covered, float(b))
-    return found
+    low = low[order]
+    # up to where the intervals that begin before this one reach
+    covered = np.maximum.accumulate(np.append(0.0, high[order]))[:-1]
+    return [min(float(end), maximum) for end in low[(low > covered) & (maximum > covered)]]
 
 
 def _forbidden(g: Complexes, minimum: float, leading: float) -> Reals:

@@ -158,9 +158,9 @@ def _ends(a: Reals, by: Reals, maximum: float) -> tuple[Reals, Reals]:
     """The ends of the interval of x where |a + x*by| <= maximum, for each time."""
     moved = np.abs(by) > NEGLIGIBLE
     slope = np.where(moved, by, 1.0)
-    ends = np.sort(np.array([(-maximum - a) / slope, (maximum - a) / slope]), axis=0)
+    one, other = (-maximum - a) / slope, (maximum - a) / slope
     fixed = np.where(np.abs(a) <= maximum, -math.inf, math.inf)  # x moves nothing at this time
-    return np.where(moved, ends[0], fixed), np.where(moved, ends[1], -fixed)
+    return np.where(moved, np.minimum(one, other), fixed), np.where(moved, np.maximum(one, other), -fixed)
 
 
 def _smallest_peak(u: Reals, by: Reals, low: float, high: float) -> float:
