@@ -33,8 +33,9 @@ demo: setup
 system:
 	@sh tools/system-packages $(DEBIAN)
 
+# THEN is a command that runs beside the tests once those on a bus are through, as continuous integration gives one.
 test: setup system
-	tools/run-tests $(BIN)/python
+	tools/run-tests $(BIN)/python $(THEN)
 
 # Where there is no container engine, one is installed as the packages above are, and runs for this test alone.
 compose-test:

@@ -62,13 +62,43 @@ def test_the_status_is_that_of_what_fails_alone_too(
         (tmp_path / name).mkdir()
         (tmp_path / name / f"test_{name}.py").write_text(source)
         lanes.append(tool.Lane(name, (name,), beside=("-q",)))
-    assert tool.main(sys.executable, tuple(lanes), (check,)) == status
+    assert tool.main(sys.executable, (), tuple(lanes), (check,)) == status
     told = capfd.readouterr().out
     for name, source in zip(("vcan", "hub", "computing"), tests, strict=True):
         named = f"   {name}/test_{name}.py::test_passes_alone" in told
         assert named == ("test_passes_alone" in source)
         assert (f"{name}/test_{name}.py" in told) or "fails" not in source
     assert "== lane vcan" in told and "== lane hub" in told
+
+
+@pytest.mark.parametrize(
+    ("command", "status", "again"),
+    [
+        ("echo began; test -e vcan-ran -a -e hub-ran", 0, False),
+        ("test -e second || { touch second; exit 2; }", 0, True),
+        ("exit 3", 3, True),
+    ],
+    ids=["it passes behind the two lanes", "it passes alone", "it fails"],
+)
+def test_a_command_runs_when_the_lanes_on_a_bus_are_through(
+    tool: ModuleType,
+    command: str,
+    status: int,
+    again: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
+    (tmp_path / "pytest.ini").write_text("[pytest]\n")
+    for name in ("vcan", "hub", "computing"):
+        (tmp_path / f"test_{name}.py").write_text(f"def test(): open('{name}-ran', 'w').close()\n")
+    lanes = tuple(tool.Lane(name, (f"test_{name}.py",), beside=("-q",)) for name in ("vcan", "hub", "computing"))
+    assert tool.main(sys.executable, ("sh", "-c", command), lanes, ("true",)) == status
+    told = capfd.readouterr().out
+    assert f"== sh -c {command}: " in told and ("began" in told) == ("began" in command)
+    assert ("once more, alone" in told) == again
 
 
 def test_no_folder_of_tests_is_left_out(tool: ModuleType) -> None:
