@@ -114,11 +114,6 @@ class Stand:
         self.left = None
         self.stalls.longest_s = 0.0
 
-    def left_alone(self) -> None:
-        """Its fault is over, and its plant hardly samples until the next job."""
-        self.hub.fault, self.hub.pv_broken = well, False
-        self.site.left_alone()
-
     def in_stage(self, stage: Stage) -> str:
         """The URL of a job in that stage, of a loop that was at rest."""
         self.at_rest(PACE * stage.pace)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from typing import Any
 
@@ -66,37 +66,38 @@ EXPECTED: dict[tuple[str, str], tuple[str, ...]] = {
 """By fault and stage: state and reason of the job."""
 
 
+class Stands:
+    """One stand at a time: its five processes take the processor's time also while another one is looked at."""
+
+    def __init__(self, folders: pytest.TempPathFactory) -> None:
+        self._folders = folders
+        self._stack = ExitStack()
+        self._stand: tuple[Needs, Stand] | None = None
+
+    def with_needs(self, needs: Needs) -> Stand:
+        if self._stand is None or self._stand[0] != needs:
+            self.close()
+            try:
+                self._stand = needs, Stand(self._stack, self._folders.mktemp("stand"), needs=needs)
+            except Missing as missing:
+                assert not os.environ.get("CI"), f"the tests need {missing}"
+                pytest.skip(f"needs {missing}; `make faults` fails without")
+        return self._stand[1]
+
+    def close(self) -> None:
+        self._stand = None
+        self._stack.close()
+
+
 @pytest.fixture(scope="module")
-def all_stands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[Needs, Stand]]:
-    with ExitStack() as stack:
-        yield _Stands(stack, tmp_path_factory)
-
-
-@pytest.fixture
-def stands(all_stands: dict[Needs, Stand]) -> Iterator[dict[Needs, Stand]]:
-    yield all_stands
-    for stand in all_stands.values():
-        stand.left_alone()
-
-
-class _Stands(dict[Needs, Stand]):
-    """One for each kind of need, when it is first asked for."""
-
-    def __init__(self, stack: ExitStack, folders: pytest.TempPathFactory) -> None:
-        self._stack, self._folders = stack, folders
-
-    def __missing__(self, needs: Needs) -> Stand:
-        try:
-            self[needs] = Stand(self._stack, self._folders.mktemp("stand"), needs=needs)
-        except Missing as missing:
-            assert not os.environ.get("CI"), f"the tests need {missing}"
-            pytest.skip(f"needs {missing}; `make faults` fails without")
-        return self[needs]
+def stands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stands]:
+    with closing(Stands(tmp_path_factory)) as stands:
+        yield stands
 
 
 @pytest.mark.parametrize(("fault", "stage"), EXPECTED)
-def test_the_loop_ends_safe_and_the_job_says_why(fault: str, stage: str, stands: dict[Needs, Stand]) -> None:
-    one = campaign.calm_ending(stands[ALL_FAULTS[fault].needs], fault, stage)
+def test_the_loop_ends_safe_and_the_job_says_why(fault: str, stage: str, stands: Stands) -> None:
+    one = campaign.calm_ending(stands.with_needs(ALL_FAULTS[fault].needs), fault, stage)
     assert not one.bad, one
     assert f"{one.state} {one.reason}" in EXPECTED[fault, stage], one
     assert one.kept > 0
@@ -118,16 +119,14 @@ WATCHED_ENDS = {
 
 
 @pytest.mark.parametrize(("fault", "moment"), WATCHED_ENDS)
-def test_a_watched_loop_never_has_gains_that_nobody_decided_on(
-    fault: str, moment: str, stands: dict[Needs, Stand]
-) -> None:
-    one = campaign.calm_ending(stands[ALL_FAULTS[fault].needs], fault, moment)
+def test_a_watched_loop_never_has_gains_that_nobody_decided_on(fault: str, moment: str, stands: Stands) -> None:
+    one = campaign.calm_ending(stands.with_needs(ALL_FAULTS[fault].needs), fault, moment)
     assert not one.bad, one
     assert one.state in WATCHED_ENDS[fault, moment], one
 
 
-def test_frames_that_make_no_sense_are_passed_over(stands: dict[Needs, Stand]) -> None:
-    stand = stands[Needs()]
+def test_frames_that_make_no_sense_are_passed_over(stands: Stands) -> None:
+    stand = stands.with_needs(Needs())
     stand.at_rest(PACE)
     with senseless_frames(stand, ""):
         before = stand.site.read("sample_number")
