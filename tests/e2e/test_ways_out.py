@@ -13,6 +13,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -21,6 +22,8 @@ from loopwright.protocol.profile import Mode
 from loopwright.protocol.tuner import FailureKind, TunerError
 from tests.e2e.plantsite import MANUAL_PERMITTED, MODEL_14, ON_VCAN, STAGES, TAG, Plantsite, Stage
 
+LOOP = replace(MODEL_14, ts=0.05)
+"""Some seventy samples in an ultimate period: each takes the processes of the loop a few ms."""
 PACE = 5.0
 BACK_WITHIN_S = 2.5
 """1.5 s of heartbeat time, and what the device's tick and reading it all back by SDO take on a slow machine."""
@@ -39,7 +42,7 @@ MORE_LOOPS = (
 @pytest.fixture(scope="module")
 def processes(bus: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plantsite]:
     with ExitStack() as stack:
-        yield Plantsite(stack, tmp_path_factory.mktemp("site"), MODEL_14, bus, MORE_LOOPS, changes=MANUAL_PERMITTED)
+        yield Plantsite(stack, tmp_path_factory.mktemp("site"), LOOP, bus, MORE_LOOPS, changes=MANUAL_PERMITTED)
 
 
 @pytest.fixture(params=EARLY)
@@ -237,7 +240,7 @@ def test_kill_9_of_the_service_leaves_the_controller_to_itself_and_the_job_resum
 def test_sample_times_that_differ_and_a_wrong_action(here: Plantsite, stage: str) -> None:
     """A second pair beside the first, whose plant is held."""
     here.write("plant_samples_to_run", 0)
-    own = ("--bus", here.bus, "--ts", "0.05", "--node")
+    own = ("--bus", here.bus, "--ts", "0.02", "--node")
     controller = here.launch(
         "direct", "loopwright.controller", *own, "0x21", "--plant-node", "0x11", "--channels", "2",
         "--kp", "80", "--ti", "1.2", "--direct",
@@ -251,7 +254,7 @@ def test_sample_times_that_differ_and_a_wrong_action(here: Plantsite, stage: str
         "--controller-node",
         "0x21",
         "--model",
-        MODEL_14.model,
+        LOOP.model,
         "--speed",
         "max",
     )
