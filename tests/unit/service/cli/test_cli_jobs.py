@@ -38,6 +38,7 @@ class Through:
     def get(self, path: str, **query: Any) -> Any:
         return self._checked(self._client.get(path, params={k: v for k, v in query.items() if v is not None}))
 
+    computed = get
     samples_of = Client.samples_of
     pages = Client.pages
     file = Client.file
