@@ -1,6 +1,6 @@
 """The lateness of the event loop: while it is busy, every other request and stream waits.
 
-A task asks to be woken every 20 ms and measures how late it is. No request should block the loop for 50 ms.
+A task asks to be woken every 10 ms and measures how late it is. No request should block the loop for 50 ms.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from loopwright.service.telemetry.metrics import LATE_SECONDS, LATEST_SECONDS
 
 log = logging.getLogger(__name__)
 
-EVERY_S = 0.02
+EVERY_S = 0.01
 """Wall time between two measurements, s."""
 MAX_S = 0.05
 """Lateness above which a warning is logged, at most once a minute, s."""
