@@ -5,7 +5,7 @@
 # make hostile an hour of hostile clients, live           make docs  the documents as a site
 # make compose-test    the containers, with a real engine      make bench-tuning    how well "fast" tunes 121 plants
 
-# Debian builds its Python with optimisations that pyenv leaves out: a sixth less processor time for all the tests.
+# Debian builds its Python with optimisations that pyenv leaves out: the tests take up to a sixth less processor time.
 PYTHON ?= $(shell /usr/bin/python3 -c "import ensurepip, sys; assert sys.version_info > (3, 11)" 2>/dev/null && echo /usr/bin/)python3
 VENV := .venv
 BIN := $(VENV)/bin
