@@ -4,6 +4,7 @@ import functools
 import json
 import os
 import socket
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Mapping, Sequence
@@ -43,6 +44,16 @@ def logs(service: str) -> str:
 
 def inspect(service: str, what: str) -> str:
     return output("docker", "inspect", "--format", what, container(service)).strip()
+
+
+def signalled(service: str, since: float) -> float:
+    """When the engine has first sent a signal to a container since a time, both in seconds of the Unix clock."""
+    between = ("--since", f"{since:.9f}", "--until", f"{time.time():.9f}")
+    its = ("--filter", f"container={container(service)}", "--filter", "event=kill")
+    sent = output("docker", "events", *between, *its, "--format", "{{.TimeNano}}").split()
+    if not sent:
+        raise Wrong(f"the engine has sent no signal to {service}")
+    return int(sent[0]) / 1e9
 
 
 def in_image(*command: str, options: Sequence[str] = ()) -> str:

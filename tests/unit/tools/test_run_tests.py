@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_loader
@@ -108,3 +109,14 @@ def test_no_folder_of_tests_is_left_out(tool: ModuleType) -> None:
     marked = [each for each in (ROOT / "tests").glob("*/*.py") if "mark.vcan" in each.read_text()]
     of_vcan = {each for each in vcan.tests if each.startswith("tests/")}
     assert {f"tests/{each.parent.name}" for each in marked} == of_vcan
+
+
+@pytest.mark.parametrize("name", ["vcan", "hub", "computing"])
+def test_pytest_takes_the_options_of_each_lane(tool: ModuleType, name: str) -> None:
+    (lane,) = (lane for lane in tool.LANES if lane.name == name)
+    options = [each for each in (*lane.tests, *lane.beside) if each.startswith("-") and "--ignore" not in each]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *options, "-qq", "--collect-only", "tests/unit/tools/test_run_tests.py"],
+        capture_output=True, text=True, cwd=ROOT,
+    )  # fmt: skip
+    assert done.returncode == (5 if name == "vcan" else 0), done.stdout + done.stderr  # 5: nothing is selected
