@@ -4,7 +4,7 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from functools import partial
 
@@ -54,7 +54,8 @@ def stack(**settings: str) -> Iterator[None]:
     check("down leaves no container, volume or network", not left, left)
 
 
-def scenario(kind: str, *more: Callable[[], None]) -> None:
+def scenario(kind: str, *more: Callable[[], None], briefly: bool = False) -> None:
+    """briefly: without the stop and without restarts of what is not the bus itself: they are the same on each bus."""
     tell(f"\n== {kind}")
     with stack(LOOPWRIGHT_BUS=kind):
         started = time.monotonic()
@@ -66,8 +67,9 @@ def scenario(kind: str, *more: Callable[[], None]) -> None:
         _demonstrate(seconds)
         tell("memory      " + memory(DEVICES))
         _killed_in_mid_stage()
-        _stopped_in_mid_stage()
-        _restart_each()
+        if not briefly:
+            _stopped_in_mid_stage()
+        _restart_each(("bus",) if briefly else DEVICES)
         for one in more:
             one()
 
@@ -128,8 +130,8 @@ def _stopped_in_mid_stage() -> None:
     check("the next demo goes on from there", wait_for("demo", 300.0) == 0, logs("demo"))
 
 
-def _restart_each() -> None:
-    for name in DEVICES:
+def _restart_each(names: Sequence[str]) -> None:
+    for name in names:
         started = time.monotonic()
         before = started_at()
         compose("restart", name)

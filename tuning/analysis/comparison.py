@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 from loopwright.tuning.analysis.assessment import assess
 from loopwright.tuning.analysis.step_figures import StepFigures
+from loopwright.tuning.analysis.step_response import step_figures
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model, integrators
 from loopwright.tuning.reasons import Ended
@@ -200,6 +201,14 @@ def loop_performance(model: Model, gains: Gains, sample_time_s: float = 0.0) -> 
         setpoint=_step(setpoint, offset and not integrators(model)),
         load=_step(load, offset),
     )
+
+
+def setpoint_performance(model: Model, gains: Gains) -> StepPerformance | None:
+    """The answer to a set-point step alone, as `loop_performance` has it; None where the loop is unstable."""
+    try:
+        return _step(step_figures(model, gains, band=BAND), gains.Ti == 0.0 and not integrators(model))
+    except Ended:
+        return None
 
 
 def weighted_IAE(found: LoopPerformance, setpoint: float, load: float, share: float = 0.5) -> float | None:

@@ -18,6 +18,7 @@ from enum import StrEnum
 import numpy as np
 from scipy.optimize import minimize
 
+from loopwright.tuning.analysis.comparison import StepPerformance, setpoint_performance
 from loopwright.tuning.analysis.stability import is_stable
 from loopwright.tuning.fast.gain_bounds import does_not_encircle, largest_gains
 from loopwright.tuning.fast.iae import Cost, LoopCost
@@ -203,6 +204,8 @@ class GainDesign:
         """The bounds that are in effect."""
         self.without_time: OptimalGains | None = None
         """The gains that others are measured by, see `best_within`."""
+        self._best_under: dict[DesignBounds, OptimalGains] = {}
+        self._steps: dict[Gains, StepPerformance | None] = {}
 
     def best(self) -> OptimalGains:
         """The best PI, or the best PID where it is permitted and lowers J, under the bounds on Ms, Mt, the noise gain
@@ -234,12 +237,23 @@ class GainDesign:
         left out.
         Raises Refused, NOT_ROBUST.
         """
+        if without_time is None and bounds in self._best_under:
+            return self._best_under[bounds]
         self.bounds, self.without_time = bounds, without_time
         self.minimum = None if without_time is None else without_time.minimum
         try:
-            return self._best()
+            best = self._best()
         finally:
             self.bounds, self.without_time = DesignBounds(self.spec.Ms), None
+        if without_time is None:
+            self._best_under[bounds] = best
+        return best
+
+    def setpoint_step(self, gains: Gains) -> StepPerformance | None:
+        """The exact response of the continuous loop to a set-point step; None where the loop is unstable."""
+        if gains not in self._steps:
+            self._steps[gains] = setpoint_performance(self.model, gains)
+        return self._steps[gains]
 
     def J(self, best: OptimalGains, minimum: Cost) -> float:
         """J of these gains over other smallest IAE."""

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopwright.tuning.analysis.comparison import BAND, loop_performance
+from loopwright.tuning.analysis.comparison import BAND
 from loopwright.tuning.fast.design import MAX_PRICE, WIDER_OVERSHOOTS, GainDesign, OptimalGains
 from loopwright.tuning.fast.iae import Cost
 from loopwright.tuning.fast.weight_bounds import KEPT, DesignBounds, Missed
@@ -260,7 +260,7 @@ class _RequirementSearch:
 
     def _missed(self, best: OptimalGains, settling: bool = True) -> Missed:
         """By how much the exact response misses the requirements. settling: the settling time too."""
-        reached = loop_performance(self.design.model, best.gains).setpoint
+        reached = self.design.setpoint_step(best.gains)
         if reached is None:
             return Missed(math.inf, math.inf)
         settled = math.inf if reached.settling_s is None else reached.settling_s
@@ -318,7 +318,7 @@ def _others(design: GainDesign) -> Iterator[str]:
     if spec.mv_peak is not None:
         free = _RequirementSearch(design, replace(search.bounds, mv_peak=None)).at(spec.Ms)
         if free is not None and free.kept:
-            reached = loop_performance(design.model, free.best.gains).setpoint
+            reached = design.setpoint_step(free.best.gains)
             assert reached is not None
             peak = _up(reached.mv_peak)
             if _RequirementSearch(design, replace(search.bounds, mv_peak=peak)).found() is not None:

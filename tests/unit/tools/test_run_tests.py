@@ -33,6 +33,7 @@ def tool(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     loader.exec_module(module)
     for name in ("LOOPWRIGHT_REQUIRE_VCAN", "LOOPWRIGHT_REQUIRE_BROWSER", "OPENBLAS_NUM_THREADS"):
         monkeypatch.setenv(name, "1")  # so that it is as before when this test is over
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
     return module
 
 
