@@ -5,7 +5,6 @@ from __future__ import annotations
 import socket
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 from tests.e2e.plantsite import MODEL_14, Plantsite
 from tests.forked import ForkedProcess
 
-CASE = replace(MODEL_14, ts=0.05)
+CASE = MODEL_14
 TAG = "TIC-101"
 """Of the loop that has its plant and its controller."""
 LOOP = MappingProxyType({"tag": TAG, "description": "Jacket of reactor 1", "area": "Reactor", "pv_unit": "degC"})

@@ -32,7 +32,10 @@ TAG = "LOOP"
 
 @dataclass(frozen=True)
 class Case:
-    """A loop on the bus. Ku in percent per PV unit, Pu in s: the exact values."""
+    """A loop on the bus. Ku in percent per PV unit, Pu in s: the exact values of the plant without its sampling.
+
+    An ultimate period has some seventy samples, each of which takes the processes of the loop a few ms.
+    """
 
     model: str
     ts: float
@@ -46,9 +49,9 @@ class Case:
     Pu_s: float
 
 
-MODEL_14 = Case("model-14", 0.02, 80.0, 1.2, 50.0, (49.0, 51.0), 9.1, 0.1, 205.0, 3.32)
-MODEL_41 = Case("model-41", 0.1, 20.0, 12.0, 50.0, (49.0, 51.0), 25.0, 0.1, 118.77, 17.719)
-SOPDT = Case("sopdt", 0.1, 100.0, 12.0, 50.0, (49.0, 51.0), 37.8, 0.1, 787.57, 11.66)
+MODEL_14 = Case("model-14", 0.05, 80.0, 1.2, 50.0, (49.0, 51.0), 9.1, 0.1, 205.0, 3.32)
+MODEL_41 = Case("model-41", 0.3, 20.0, 12.0, 50.0, (49.0, 51.0), 25.0, 0.1, 118.77, 17.719)
+SOPDT = Case("sopdt", 0.2, 100.0, 12.0, 50.0, (49.0, 51.0), 37.8, 0.1, 787.57, 11.66)
 REACTOR = Case("reactor", 0.25, 0.5, 30.0, 49.2838831323648137, (30.0, 70.0), 31.8, 1.0, 1.529, 42.5)
 
 

@@ -14,7 +14,7 @@ import pytest
 from tests.e2e.plantsite import MODEL_14, Plantsite
 
 pytestmark = pytest.mark.timeout(400)
-LOOP = replace(MODEL_14, ts=0.05, kp=30.0, ti=6.0, pv_limits=(40.0, 60.0))
+LOOP = replace(MODEL_14, kp=30.0, ti=6.0, pv_limits=(40.0, 60.0))
 PACE = 4.0
 RISES_TO = 3.3
 """Times the gain of the plant: under the new gains each period is then 1.4 times as large as the one before, under the

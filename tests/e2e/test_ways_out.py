@@ -13,7 +13,6 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -22,8 +21,6 @@ from loopwright.protocol.profile import Mode
 from loopwright.protocol.tuner import FailureKind, TunerError
 from tests.e2e.plantsite import MANUAL_PERMITTED, MODEL_14, ON_VCAN, STAGES, TAG, Plantsite, Stage
 
-LOOP = replace(MODEL_14, ts=0.05)
-"""Some seventy samples in an ultimate period: each takes the processes of the loop a few ms."""
 PACE = 5.0
 BACK_WITHIN_S = 2.5
 """1.5 s of heartbeat time, and what the device's tick and reading it all back by SDO take on a slow machine."""
@@ -42,7 +39,7 @@ MORE_LOOPS = (
 @pytest.fixture(scope="module")
 def processes(bus: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plantsite]:
     with ExitStack() as stack:
-        yield Plantsite(stack, tmp_path_factory.mktemp("site"), LOOP, bus, MORE_LOOPS, changes=MANUAL_PERMITTED)
+        yield Plantsite(stack, tmp_path_factory.mktemp("site"), MODEL_14, bus, MORE_LOOPS, changes=MANUAL_PERMITTED)
 
 
 @pytest.fixture(params=EARLY)
@@ -254,7 +251,7 @@ def test_sample_times_that_differ_and_a_wrong_action(here: Plantsite, stage: str
         "--controller-node",
         "0x21",
         "--model",
-        LOOP.model,
+        MODEL_14.model,
         "--speed",
         "max",
     )

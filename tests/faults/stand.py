@@ -29,7 +29,7 @@ from tests.faults.ending import Eye, Home, Stalls
 from tests.faults.faulty_hub import FaultyHub, well
 from tests.unit.service.postgres import Server, binaries
 
-LOOP = replace(MODEL_14, ts=0.05)
+LOOP = MODEL_14
 PACE = 10.0
 """Three stands at a time are then what two processors can just do."""
 HOME = Home(Mode.AUTOMATIC, LOOP.sp, LOOP.kp, LOOP.ti, mv=50.0)
@@ -52,8 +52,6 @@ class Needs:
     small_disk: bool = False
     own_clock: bool = False
     defect: bool = False
-
-
 
 
 class Missing(Exception):
