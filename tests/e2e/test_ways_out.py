@@ -33,6 +33,7 @@ MORE_LOOPS = (
     {"tag": "ABSENT", "controller_node": 0x55},
     {"tag": "OTHER-TIME", "controller_node": 0x21, "channel": 2},
     {"tag": "DIRECT", "controller_node": 0x21, "plant_node": 0x11},
+    {"tag": "INNER", "controller_node": 0x22, "plant_node": 0x12, "setpoint_from": "remote", "outer_loop": TAG},
 )
 
 
@@ -125,6 +126,23 @@ def test_not_at_rest(here: Plantsite, early: Stage) -> None:
 def test_mv_without_room(here: Plantsite, early: Stage) -> None:
     assert ended(here, here.retune(mv_low=49.9, mv_high=60, **early.options)) == ("refused", "saturated")
     assert here.is_home()
+
+
+def test_mv_at_its_limit_in_mid_pulse(here: Plantsite) -> None:
+    url = brought_into(here, "setpoint-pulses")
+    here.write("plant_disturbance", -60.0)  # of MV's range, half of which is left
+    here.until(url, lambda job: here.read("controller_mv") > 99.9 or job["state"] != "running")
+    outcome = ended(here, url)
+    assert here.read("controller_mv") > 99.9
+    assert outcome == ("refused", "mv_limit")
+    assert here.is_home()
+
+
+def test_the_set_point_of_an_inner_loop_is_not_pulsed(here: Plantsite) -> None:
+    answer = here.http.post("/loops/INNER/retune", json={"method": "setpoint"})
+    assert (answer.status_code, answer.json()["reason"]) == (409, "setpoint_is_driven")
+    assert f"comes from {TAG}" in answer.json()["detail"] and "to local set-point" in answer.json()["detail"]
+    assert here.http.get("/loops/INNER/jobs").json() == []
 
 
 def test_what_is_refused_at_once(here: Plantsite) -> None:
