@@ -9,6 +9,8 @@ from typing import Any
 
 GUEST_PATIENCE = 5.0
 """User-mode Linux starts a process that much more slowly, and has one processor for all of them."""
+GUEST_LOOKS_EVERY_S = 5.0
+"""Each look asks the engine by two processes there, and takes a second of its processor."""
 
 
 class Wrong(Exception):
@@ -40,7 +42,7 @@ def until(what: str, found: Callable[[], Any], patience_s: float) -> Any:
     while time.monotonic() < give_up:
         if value := found():
             return value
-        time.sleep(1.0 if in_uml() else 0.3)
+        time.sleep(GUEST_LOOKS_EVERY_S if in_uml() else 0.3)
     raise Wrong(f"waited in vain for {what}")
 
 
