@@ -173,7 +173,8 @@ class Client:
         import httpx
 
         try:
-            timeout = httpx.Timeout(_PATIENCE_S, read=patience_s)
+            usual = patience_s == _PATIENCE_S
+            timeout = httpx.USE_CLIENT_DEFAULT if usual else httpx.Timeout(_PATIENCE_S, read=patience_s)
             return self._http.request(method, path, params=query, json=body, headers=headers, timeout=timeout)
         except httpx.TransportError as error:
             carried_out = "" if method == "GET" else "\n" + _PERHAPS_CARRIED_OUT
