@@ -31,7 +31,7 @@ from tests.unit.service.postgres import Server, binaries
 
 LOOP = MODEL_14
 PACE = 10.0
-"""Three stands at a time are then what two processors can just do."""
+"""As a factor of real time: one stand then takes more than half a processor."""
 HOME = Home(Mode.AUTOMATIC, LOOP.sp, LOOP.kp, LOOP.ti, mv=50.0)
 SMALL_DISK_MIB = 8
 

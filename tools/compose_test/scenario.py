@@ -115,9 +115,9 @@ def _stopped_in_mid_stage() -> None:
     before = time.time()
     compose("stop")
     # From SIGTERM on: compose itself takes seconds to begin in user-mode Linux.
-    told = signalled("service", before)
+    signal_at = signalled("service", before)
     gone, status = inspect("service", "{{.State.FinishedAt}} {{.State.ExitCode}}").split()
-    seconds = datetime.fromisoformat(gone[:26].rstrip("Z") + "+00:00").timestamp() - told
+    seconds = datetime.fromisoformat(gone[:26].rstrip("Z") + "+00:00").timestamp() - signal_at
     tell(f"stop        service in the relay stage: gone after {seconds:.1f} s with status {status}")
     # 143: ended by SIGTERM when everything was done, as the web server does it; 137: the engine lost its patience.
     check(f"graceful within {STOPPED_WITHIN_S:g} s", seconds < STOPPED_WITHIN_S and status in ("0", "143"), status)
