@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 
 import httpx
@@ -25,8 +26,8 @@ def through(
             raise now
         return now
 
+    monkeypatch.setattr(httpx, "Client", partial(httpx.Client, transport=httpx.MockTransport(answer)))
     client = Client("http://gateway")
-    monkeypatch.setattr(client, "_http", httpx.Client(base_url="http://gateway", transport=httpx.MockTransport(answer)))
     now = [0.0]
 
     def sleep(seconds: float) -> None:
