@@ -17,7 +17,7 @@ from sqlalchemy import Engine as Database
 
 from loopwright.service.jobs.engine import WORKFLOW_VERSION
 from loopwright.service.store.damage import Damage
-from loopwright.service.store.database import ENGINE_FILE, checkpoint, sqlite
+from loopwright.service.store.database import ENGINE_FILE, checkpoint, close_database, sqlite
 from loopwright.service.store.lock import FolderInUse
 
 log = logging.getLogger(__name__)
@@ -151,7 +151,7 @@ class DurableEngine:
                 checkpoint(self._own)
         self._damage.close()
         if self._own is not None:
-            self._own.dispose()
+            close_database(self._own)
 
 
 def _set_aside(folder: Path) -> None:

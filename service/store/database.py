@@ -14,7 +14,7 @@ from typing import Any
 from sqlalchemy import Engine, create_engine, event, inspect, make_url, text
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 from sqlalchemy.orm import Session, sessionmaker
-from sqlalchemy.pool import NullPool
+from sqlalchemy.pool import ConnectionPoolEntry, NullPool
 
 _log = logging.getLogger(__name__)
 
@@ -93,6 +93,16 @@ def sqlite(file: Path) -> Engine:
     engine = create_engine(f"sqlite:///{file}", connect_args={"timeout": float(WAIT_S)})
     event.listen(engine, "connect", pragmas)
     return engine
+
+
+def close_database(engine: Engine) -> None:
+    """Closes the connections, and each that a thread still has as soon as the thread gives it back."""
+    event.listen(engine, "checkin", _closed_at_once)
+    engine.dispose()
+
+
+def _closed_at_once(_: object, record: ConnectionPoolEntry) -> None:
+    record.invalidate()
 
 
 def checkpoint(engine: Engine) -> None:

@@ -26,6 +26,7 @@ from loopwright.service.store.database import (
     WAIT_S,
     BadDatabase,
     checkpoint,
+    close_database,
     migrate,
     open_database,
     postgresql,
@@ -136,7 +137,7 @@ class Store:
             self.host_lock.close()
         for engine in ("engine", "_reserve"):
             if hasattr(self, engine):
-                getattr(self, engine).dispose()
+                close_database(getattr(self, engine))
         self.folder_lock.close()
 
     def check_lock(self) -> None:

@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import Engine as Database
 
 from loopwright.service.jobs.dbos_engine import DurableEngine
-from loopwright.service.store.database import open_database
+from loopwright.service.store.database import close_database, open_database
 
 Make = Callable[[str], DurableEngine]
 
@@ -36,7 +36,7 @@ def make(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Make]:
     for engine in engines:
         engine.close()
     for database in databases:
-        database.dispose()
+        close_database(database)
 
 
 class Runs:

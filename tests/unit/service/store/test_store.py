@@ -173,6 +173,16 @@ def test_a_database_has_one_service_per_host_name(tmp_path: Path, postgres: Serv
         store.close()
 
 
+def test_a_connection_that_comes_back_after_the_end_is_closed(tmp_path: Path, postgres: Server) -> None:
+    """A thread of the engine may outlast it."""
+    store = Store(tmp_path, postgres.database())
+    connection = store.engine.connect()
+    held = connection.connection.driver_connection
+    store.close()
+    connection.close()
+    assert held is not None and held.closed
+
+
 def test_a_lock_lost_with_the_server_is_taken_again_unless_another_was_faster(
     tmp_path: Path, postgres: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
