@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -37,6 +36,7 @@ from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Mode, Note, Sample, SetGains, SetSetpoint, StageDone, StageStarted
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused
+from tests.unit.service.processes import until
 
 OLD, NEW = Gains(0.5, 2.0), Gains(0.75, 3.0)
 TAG = "TIC-101"
@@ -321,11 +321,9 @@ class Service:
         jobs.boot()
         return jobs
 
-    def wait(self, job_id: str, max_s: float = 60.0) -> None:
+    def wait(self, job_id: str) -> None:
         """Until the job is over."""
-        deadline = time.monotonic() + max_s
-        while JobState(self.store.get(job_id).state) in ACTIVE and time.monotonic() < deadline:
-            time.sleep(0.005)
+        until(lambda: JobState(self.store.get(job_id).state) not in ACTIVE, f"the end of job {job_id}")
 
     def close(self) -> None:
         self.tune.hold.set()

@@ -160,6 +160,7 @@ def two_gateways(folder: Path, database: str) -> Iterator[TwoGateways]:
     try:
         yield found
     finally:
+        found.here.lose_patience()  # a test that has failed may have left somebody waiting
         found.decided.shutdown()
         found.here.close()
         found.there.close()

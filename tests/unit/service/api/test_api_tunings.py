@@ -271,7 +271,7 @@ def test_another_Ms_from_the_record_of_a_job(service: Service, client: TestClien
         for ms in (1.4, 1.6)
     ]
     for row in rows:
-        service.wait(row.id, 60)
+        service.wait(row.id)
     asked, other = (client.get(f"/jobs/{row.id}").json() for row in rows)
     assert asked["state"] == other["state"] == "rehearsed", (asked["detail"], other["detail"])
     (found,) = client.get(f"{other['url']}/alternatives?ms=1.4").json()["methods"]

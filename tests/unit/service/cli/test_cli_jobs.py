@@ -205,7 +205,7 @@ def rehearsed(service: Service, through: Through) -> str:
     from loopwright.service.inputs.request import PlantModel, retune_request
 
     row = jobs.start(TAG, retune_request(dry_run=True, plant=PlantModel(**PLANT)))
-    service.wait(row.id, 60)
+    service.wait(row.id)
     jobs.stop()
     assert service.store.get(row.id).state == "rehearsed", service.store.get(row.id).detail
     return row.id

@@ -40,7 +40,7 @@ def dry_run(service: Service, **options: Any) -> JobView:
     """A dry run of the real procedure, to its end."""
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
     row = jobs.start(TAG, retune_request(**QUICK | options))
-    service.wait(row.id, 60)
+    service.wait(row.id)
     jobs.stop()
     return shown(service, row.id)
 
@@ -159,7 +159,7 @@ def test_beside_a_test_the_gains_are_those_from_before_it(tmp_path: Path) -> Non
     assert service.tune.inside.wait(60)
     assert service.controller.state.gains == NEW and service.controller.state.on_trial
     row = service.jobs.start(TAG, retune_request(**QUICK))
-    service.wait(row.id, 60)
+    service.wait(row.id)
     view = shown(service, row.id)
     assert view.old_gains is not None and view.old_gains.Kp == OLD.Kp
     service.tune.hold.set()

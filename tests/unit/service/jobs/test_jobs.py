@@ -135,7 +135,7 @@ def test_a_job_that_is_looked_at_is_as_before(service: Service) -> None:
 def test_a_real_rehearsal_through_a_job(service: Service, method: str) -> None:
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
     row = jobs.start(TAG, retune_request(dry_run=True, method=method))
-    service.wait(row.id, 60)
+    service.wait(row.id)
     jobs.stop()
     row = service.store.get(row.id)
     assert (row.state, row.reason) == ("rehearsed", None), row.detail
@@ -165,7 +165,7 @@ def test_a_real_rehearsal_through_a_job(service: Service, method: str) -> None:
 def test_samples_of_a_rehearsal_are_kept(service: Service) -> None:
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
     row = jobs.start(TAG, retune_request(dry_run=True, ms=1.4))
-    service.wait(row.id, 60)
+    service.wait(row.id)
     jobs.stop()
     stages = [stage for stage, _ in service.store.samples(row.id)]
     assert {"preflight", "relay", "verify"} <= set(stages)
@@ -183,7 +183,7 @@ def test_a_running_job_hears_of_an_abort_that_the_database_does_not_take(
     monkeypatch.setattr(service.store, "request_stop", gone)
     with pytest.raises(OperationalError):
         service.jobs.abort(row.id, "me")
-    service.wait(row.id, 60)
+    service.wait(row.id)
     row = service.store.get(row.id)
     assert (row.state, row.reason) == ("aborted", Reason.OPERATOR.value)
     assert service.controller.state.gains == OLD
@@ -195,7 +195,7 @@ def test_a_job_that_ends_for_an_abort_before_it_is_written_down_was_aborted_by_i
     write = service.store.request_stop
 
     def slow(job_id: str, *more: Any) -> Job:
-        service.wait(job_id, 60)
+        service.wait(job_id)
         return write(job_id, *more)
 
     service.tune.hold.clear()

@@ -275,7 +275,7 @@ def test_a_disk_that_takes_nothing_for_a_while(service: Service, client: TestCli
         assert refused.status_code == 503 and refused.headers["retry-after"], refused.text
     assert service.store.get(job_id).state == "running"
     disk.pragma = ""
-    service.wait(job_id, 60)
+    service.wait(job_id)
     assert service.store.get(job_id).state == JobState.PROPOSED.value
     assert sum(len(block) for _, block in service.store.samples(job_id)) == 20
     until(lambda: database(client)["ready"])
