@@ -50,12 +50,11 @@ class PassingOn:
         age_s = gateways.age_s(self._store, host)
         if age_s is None or age_s > gateways.LOST_S:
             raise GatewayLost(f"{gateways.silent(host, age_s)}; nothing was written to loop {loop}")
-        give_up = self._machine.monotonic() + PATIENCE_S
         try:
             number = decision_requests.ask(self._store, host, what, loop, job_id, by, roll_back_by_itself)
         except SQLAlchemyError as error:
             raise _not_known(text, error) from error
-        found = self._answered(number, host, text, give_up)
+        found = self._answered(number, host, text)
         if found is None:
             return False
         if found.state is RequestState.WITHDRAWN:
@@ -69,9 +68,10 @@ class PassingOn:
         raise_of(found.answer or RequestAnswer(), loop, host)
         return True
 
-    def _answered(self, number: int, host: str, text: str, give_up: float) -> DecisionRequest | None:
-        """Returns the request at its end; None where it has none at `give_up`, a time of the machine. One that a
-        gateway which has fallen silent has not begun by then is withdrawn."""
+    def _answered(self, number: int, host: str, text: str) -> DecisionRequest | None:
+        """Returns the request at its end; None where it has none in PATIENCE_S. One that a gateway which has fallen
+        silent has not begun by then is withdrawn."""
+        give_up = self._machine.monotonic() + PATIENCE_S
         while True:
             late = self._machine.monotonic() >= give_up
             try:
