@@ -56,8 +56,8 @@ class Client:
         return _json(self._answer("GET", path, _given(query), _COMPUTED_PATIENCE_S))
 
     def file(self, path: str) -> tuple[str, str]:
-        """Returns the file name that the service gives to a text, and the text."""
-        answer = self._answer("GET", path)
+        """Returns the file name that the service gives to a text, and the text, which it may have to compute."""
+        answer = self._answer("GET", path, patience_s=_COMPUTED_PATIENCE_S)
         _, _, name = answer.headers.get("Content-Disposition", "").partition('filename="')
         return name.partition('"')[0].rpartition("/")[2] or "answer", answer.text
 
@@ -185,10 +185,11 @@ class Client:
     ) -> ApiError:
         import httpx
 
-        if isinstance(error, httpx.ConnectError):
+        if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
             why = f"no service at {self.url} ({error}); start one with: loopwright serve"
         elif isinstance(error, httpx.TimeoutException):
-            why = f"the service at {self.url} has not answered {asked} within {patience_s:g} s; its log says why"
+            within_s = patience_s if isinstance(error, httpx.ReadTimeout) else _PATIENCE_S
+            why = f"the service at {self.url} has not answered {asked} within {within_s:g} s; its log says why"
         else:
             why = f"the service at {self.url} broke the connection at {asked} ({error}); its log says why"
         return ApiError(why + carried_out)

@@ -219,7 +219,7 @@ def alternatives_of_job(
     """Show other gains for the model that a job found, with their figures; no experiment is made."""
     wanted = None if derivative is None else str(derivative).lower()
     client = Client(url)
-    found = client.get(
+    found = client.computed(
         f"{path_of(client, job_id)}/alternatives", ms=ms, derivative=wanted, aim=aim, settling_s=settling_s,
         mv_peak=mv_peak, noise_gain=noise_gain, method=method,
     )  # fmt: skip

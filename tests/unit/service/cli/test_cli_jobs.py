@@ -43,7 +43,7 @@ class Through:
     pages = Client.pages
     file = Client.file
 
-    def _answer(self, method: str, path: str) -> Any:
+    def _answer(self, method: str, path: str, patience_s: float = 0.0) -> Any:
         answer = self._client.request(method, path)
         if not answer.is_success:
             raise ApiError(answer.text)

@@ -97,12 +97,26 @@ def test_a_service_that_is_there_is_not_said_to_be_missing(
 
 
 def test_what_the_service_computes_is_waited_for_longer(monkeypatch: pytest.MonkeyPatch) -> None:
-    client, sent = through(monkeypatch, *(httpx.Response(200, json={}) for _ in range(2)), httpx.ReadTimeout("late"))
+    client, sent = through(monkeypatch, *(httpx.Response(200, json={}) for _ in range(3)), httpx.ReadTimeout("late"))
     client.get("/loops")
     client.computed("/loops/TIC-101/observation", ms=1.4, aim=None)
-    assert [each.extensions["timeout"]["read"] for each in sent] == [30.0, 300.0]
+    client.file("/jobs/x/report")
+    assert [each.extensions["timeout"]["read"] for each in sent] == [30.0, 300.0, 300.0]
     assert sent[1].extensions["timeout"]["connect"] == 30.0 and sent[1].url.query == b"ms=1.4"
     with pytest.raises(ApiError, match="has not answered GET /loops/TIC-101/observation within 300 s"):
+        client.computed("/loops/TIC-101/observation")
+
+
+@pytest.mark.parametrize(
+    ("broken", "why"),
+    [(httpx.ConnectTimeout("timed out"), "no service at http://gateway"),
+     (httpx.WriteTimeout("timed out"), "has not answered GET /loops/TIC-101/observation within 30 s")],
+)  # fmt: skip
+def test_a_service_that_is_not_reached_is_not_waited_for_longer(
+    monkeypatch: pytest.MonkeyPatch, broken: Exception, why: str
+) -> None:
+    client, _ = through(monkeypatch, broken)
+    with pytest.raises(ApiError, match=why):
         client.computed("/loops/TIC-101/observation")
 
 
