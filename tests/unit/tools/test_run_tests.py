@@ -103,6 +103,11 @@ def test_a_command_runs_when_the_lanes_on_a_bus_are_through(
     assert ("once more, alone" in told) == again
 
 
+def test_a_command_that_is_not_there_is_said_before_anything_runs(tool: ModuleType) -> None:
+    with pytest.raises(SystemExit, match="there is no command compose-tset"):
+        tool.main(sys.executable, ("compose-tset",))
+
+
 def test_no_folder_of_tests_is_left_out(tool: ModuleType) -> None:
     vcan, hub, computing = tool.LANES
     of_hub = {each for each in hub.tests if each.startswith("tests/")}
