@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import httpx
 from fastapi.testclient import TestClient
@@ -31,6 +31,7 @@ from loopwright.service.store.store import Store
 from tests.unit.service.fakes import FakeController, FakeLoop, FakeTune, ThreadEngine, fake_rehearse, loop_entry
 from tests.unit.service.processes import until
 
+T = TypeVar("T")
 HERE, THERE = "gw-1", "gw-2"
 TAG_HERE, TAG_THERE = "TIC-1", "TIC-2"
 
@@ -49,9 +50,15 @@ class HeldClock(Machine):
     """A clock that stands still: what waits for an answer waits until a test says that the time is over."""
 
     now_s = 0.0
+    sleeps = 0
+    """How often somebody has waited."""
 
     def monotonic(self) -> float:
         return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.sleeps += 1
+        super().sleep(seconds)
 
 
 class OneGateway:
@@ -143,10 +150,14 @@ class TwoGateways:
         self.here.sql(f"UPDATE gateways SET at_s = {NOW_S} - :by WHERE name = :name", by=seconds, name=THERE)
 
     def asked(self, job_id: str, what: str = "accept") -> Future[httpx.Response]:
-        """A decision that is asked here, and waits for the gateway there, which does not look for it."""
-        before = len(self.here.requests())
-        found = self.decided.submit(self.here.decide, job_id, what)
-        until(lambda: len(self.here.requests()) > before)
+        """A decision that is asked here, as `waiting`."""
+        return self.waiting(self.here.decide, job_id, what)
+
+    def waiting(self, call: Callable[..., T], *given: object) -> Future[T]:
+        """A call of the gateway here, as soon as it waits for the gateway there, or has its answer."""
+        before = self.here.clock.sleeps
+        found = self.decided.submit(call, *given)
+        until(lambda: self.here.clock.sleeps > before or found.done())
         return found
 
     def stop_looking(self) -> None:

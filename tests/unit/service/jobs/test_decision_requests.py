@@ -320,8 +320,8 @@ def test_a_lock_whose_gateway_does_not_say_that_nothing_writes(fleet: TwoGateway
     fleet.stop_looking()
     ages_s = {"does not say": -1e6, "was withdrawn, nothing was written": 3.5}
     for number, (words, age_s) in enumerate(ages_s.items(), 1):
-        asked = fleet.decided.submit(fleet.here.jobs.locking.lock, TAG_THERE, "valve", "me")
-        until(lambda number=number: len(fleet.here.requests()) == number)  # type: ignore[misc]
+        asked = fleet.waiting(fleet.here.jobs.locking.lock, TAG_THERE, "valve", "me")
+        assert len(fleet.here.requests()) == number
         fleet.age(age_s)
         fleet.here.lose_patience()
         with pytest.raises(Conflict, match=f"locked now, but .* gateway {THERE} .*{words}"):
