@@ -1,7 +1,7 @@
 # make demo    a loop is retuned before your eyes      make test    every test and every check
 # make setup   the Python environment in .venv         make check   types, style, import directions, packages
 # make bench   every benchmark, in one table           make validate    the five papers, recomputed
-# make faults  every fault in every stage, live: 30 min    make simulate    thousands of simulated disasters
+# make faults  every fault in every stage, live: an hour  make simulate    thousands of simulated disasters
 # make hostile an hour of hostile clients, live           make docs  the documents as a site
 # make compose-test    the containers, with a real engine      make bench-tuning    how well "fast" tunes 121 plants
 

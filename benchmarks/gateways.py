@@ -109,6 +109,7 @@ def run() -> dict[str, Any]:
         "loops": LOOPS,
         "pace": PACE,
         "at_once": AT_ONCE,
+        "unpaced_at_once": UNPACED_AT_ONCE,
         "processors": os.cpu_count(),
         "paced": paced,
         "unpaced": unpaced,

@@ -186,7 +186,8 @@ def of_gateways(gateways: Figures) -> list[str]:
             f"{max(gateways['paced'], key=int)} gateways as with 1",
         ),
         row(
-            f"the same, plants as fast as {gateways['processors']} processors go",
+            f"the same, {gateways['unpaced_at_once']} jobs at once each, plants as fast as {gateways['processors']} "
+            "processors go",
             f"{rates(gateways['unpaced'])} jobs per minute, {busy(gateways['unpaced'])} processors busy, "
             f"{1e3 * gateways['unpaced']['1']['processor_s']:.0f} ms of processor for a job",
         ),

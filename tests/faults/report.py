@@ -75,7 +75,7 @@ TAIL = """## What the faults are
 - The exception is raised by the check of the next sample in the service. The load, on the plant's input, takes PV over
   a limit of the job, and the controller is the one that has to end the session for it. Where the bus between controller
   and plant is down in a pulse, MV stays at the plant where the pulse has taken it, until the bus is back or the I/O
-  reacts (2014h): therefore the 10 s of that row.
+  reacts (2014h): therefore the 10 s in the row "bus down for 10 s".
 - Disk full: the data folder is a file system of {disk} MiB, filled to its last byte.
 - Database locked, or away with SQLite: `BEGIN EXCLUSIVE` on both files by another process's connection; with PostgreSQL
   an exclusive lock on our tables, or the server stopped as by a power cut and started again.

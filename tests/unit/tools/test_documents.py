@@ -11,6 +11,7 @@ import pytest
 import typer.main
 
 from loopwright.service.cli.main import app
+from loopwright.tuning.reasons import ADVICE
 
 ROOT = Path(__file__).parents[3]
 FILES = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
@@ -33,6 +34,11 @@ def test_files_and_folders_that_it_names_are_there(document: str) -> None:
     below = {f"/{name}" for name in FILES}
     assert not {name for name in named if not any(each.endswith(f"/{name}") for each in below)}
     assert not {name for name in folders if not any(f"/{name}" in each for each in below)}
+
+
+def test_the_advice_of_each_reason_is_that_of_the_code() -> None:
+    rows = {f"| `{reason.value}` | {advice} |" for reason, advice in ADVICE.items()}
+    assert rows - set(text("docs/safety.md").splitlines()) == set()
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)
