@@ -26,7 +26,9 @@ from loopwright.tuning.identification.output_error import Fit, averaged
 from loopwright.tuning.models import Model, Reals
 from loopwright.tuning.reasons import Ended
 
-SHOWN_SETTLINGS = 2.5
+SHOWN_SETTLINGS, MAX_SHOWN_SETTLINGS = 2.5, 6.0
+"""Lengths of the time axis of a step, in settling times of the loop that settles sooner: one at which its transient
+still fills the picture, and the longest, where the other loop settles later."""
 LOAD_PCT = 10.0
 """Size of the load step that is drawn, percent of MV."""
 
@@ -122,9 +124,14 @@ def _percent(before: StepFigures, after: StepFigures) -> str:
 
 
 def _horizon(model: Model, assessed: Mapping[str, Assessment], load: bool) -> float:
+    """Returns the length of the time axis, s: both loops have settled at its end, where one of them does not settle
+    much later than the other."""
     figures = [each.load if load else each.setpoint for each in assessed.values()]
     settled = [each.settling_s for each in figures if each and each.settling_s]
-    return SHOWN_SETTLINGS * min(settled) if settled else 20.0 * (model.L + 1.0)
+    if not settled:
+        return 20.0 * (model.L + 1.0)
+    soonest = min(settled)
+    return float(np.clip(max(settled), SHOWN_SETTLINGS * soonest, MAX_SHOWN_SETTLINGS * soonest))
 
 
 def _answers(
