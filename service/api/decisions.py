@@ -4,10 +4,11 @@ network addresses and ids of keys, and is for administrators."""
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Response
-from pydantic import AwareDatetime, BaseModel, Field
+from pydantic import AfterValidator, AwareDatetime, BaseModel, Field
 
 from loopwright.service.api import problems
 from loopwright.service.api.paging import LINK, Cursor, Limit, more
@@ -18,6 +19,14 @@ from loopwright.service.states.loop_state import gains_of
 from loopwright.service.store import audit
 from loopwright.service.store.clock import stamp
 from loopwright.service.store.tables import AuditRow
+
+
+def _in_utc(at: datetime) -> datetime:
+    try:
+        return at.astimezone(UTC)
+    except OverflowError:
+        raise ValueError("in UTC this time is not within the years 1 to 9999") from None
+
 
 DecisionKind = Literal["retune", "abort", "accept", "rollback", "accept_failed", "rollback_failed"]
 KINDS: tuple[DecisionKind, ...] = ("retune", "abort", "accept", "rollback", "accept_failed", "rollback_failed")
@@ -66,7 +75,7 @@ def router(jobs: Jobs) -> APIRouter:
             Query(max_length=200, description="Only those with this name, in the request or of the key"),
         ] = None,
         begin: Annotated[
-            AwareDatetime | None,
+            Annotated[AwareDatetime, AfterValidator(_in_utc)] | None,
             Query(
                 alias="from",
                 description="Only decisions from this time on, ISO 8601 with a time zone",

@@ -24,7 +24,7 @@ def show(found: Sequence[tuple[LoopConfig, LoopCheck]]) -> None:
     )
     for config, each in found:
         if each.problem is not None:
-            console.print(f"{config.tag}: {each.problem}", markup=False, highlight=False, soft_wrap=True)
+            console.print(f"{config.tag}: {each.problem}", highlight=False, soft_wrap=True)
     wrong = sum(each.problem is not None for _, each in found)
     console.print(
         f"{wrong} of {len(found)} loops cannot be read" if wrong else f"all loops answer ({len(found)})",
@@ -71,7 +71,7 @@ def show_nodes(bus: str, found: Sequence[FoundNode]) -> None:
     for each in found:
         for problem in each.problems:
             text = f"node {node_name(each.node)}: {problem}"
-            console.print(text, markup=False, highlight=False, soft_wrap=True)
+            console.print(text, highlight=False, soft_wrap=True)
     if not any(each.device is Device.CONTROLLER for each in found):
         console.print("no controller that can be retuned answers on this bus", highlight=False)
 

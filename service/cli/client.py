@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import secrets
 import time
@@ -31,7 +32,18 @@ _PERHAPS_CARRIED_OUT = "What was asked may have been carried out: look at the lo
 
 
 class ApiError(Exception):
-    """The service refused the request or does not answer; the text says which, and what to do."""
+    """The service refused the request or does not answer; the text says which, and what to do.
+
+    status: the exit status of the command.
+    """
+
+    status = 1
+
+
+class NotSent(ApiError):
+    """What was to be sent can be no request."""
+
+    status = 2
 
 
 class Client:
@@ -43,7 +55,9 @@ class Client:
         if not url.startswith(("http://", "https://")):
             raise ApiError(f"--url takes the address of a service as http://HOST:PORT, or https, not {url!r}")
         self.url = url.rstrip("/")
-        key = os.environ.get(KEY_VARIABLE)
+        key = os.environ.get(KEY_VARIABLE, "")
+        if not (key.isascii() and key.isprintable()):
+            raise NotSent(f"{KEY_VARIABLE} has characters that no key has, or an end of a line: copy the key again")
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._http = httpx.Client(base_url=self.url, timeout=_PATIENCE_S, trust_env=False, headers=headers)
 
@@ -75,7 +89,10 @@ class Client:
         following = httpx.URL(path)
         while True:
             answer = self._answer("GET", following)
-            found += answer.json()
+            page = _json(answer)
+            if not isinstance(page, list):
+                raise _no_service(answer)
+            found += page
             if "next" not in answer.links:
                 return found
             following = httpx.URL(answer.links["next"]["url"])
@@ -89,6 +106,13 @@ class Client:
         import httpx
 
         sent, headers = body or {}, {"Idempotency-Key": secrets.token_hex(16)}
+        try:
+            json.dumps(sent, ensure_ascii=False, allow_nan=False).encode()
+        except UnicodeEncodeError:
+            raise NotSent("a text has bytes that are no UTF-8") from None
+        except ValueError:
+            wrong = (name for name, value in sent.items() if isinstance(value, float) and not math.isfinite(value))
+            raise NotSent(f"{', '.join(wrong)}: a finite number is expected") from None
         try:
             answer = self._http.post(path, json=sent, headers=headers)
         except httpx.ConnectError as error:
@@ -203,6 +227,8 @@ class Client:
             body = answer.json()
         except ValueError:
             raise ApiError(f"HTTP {answer.status_code}: {answer.text[:200]}") from None
+        if not isinstance(body, dict):
+            raise _no_service(answer)
         if answer.status_code == 401:
             body["advice"] = f"Put an API key into the environment variable {KEY_VARIABLE}."
         lines = [body.get("detail") or body.get("title"), body.get("advice"), body.get("job")]
@@ -227,5 +253,14 @@ def _events_of(answer: httpx.Response) -> Iterator[dict[str, str]]:
 
 
 def _json(answer: httpx.Response) -> object:
-    found: object = answer.json()
+    try:
+        found: object = answer.json()
+    except ValueError:
+        raise _no_service(answer) from None
     return found
+
+
+def _no_service(answer: httpx.Response) -> ApiError:
+    """The error of an answer that no Loopwright service gives."""
+    said = f"HTTP {answer.status_code}, {answer.headers.get('Content-Type', 'without a type')}"
+    return ApiError(f"what answers at {answer.url} is no Loopwright service ({said}); give its address with --url")

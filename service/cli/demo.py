@@ -243,4 +243,4 @@ class _Demo:
 
 
 def _say(line: str) -> None:
-    terminal.console.print(line, highlight=False, markup=False, soft_wrap=True)
+    terminal.console.print(line, highlight=False, soft_wrap=True)

@@ -42,9 +42,9 @@ def follow(client: Client, job_url: str, to: Console | None = None) -> JobView:
                 case StageDoneEvent(stage=stage, plant_time_s=plant_time_s, result=result):
                     found = stage_found(stage, result, "") or "done"
                     line = f"  {stage_name(stage)}: {found} (after {plant_time_s:.1f} s of plant time)"
-                    bars.console.print(line, soft_wrap=True, highlight=False, markup=False)
+                    bars.console.print(line, soft_wrap=True, highlight=False)
                 case NoteEvent(text=text):
-                    bars.console.print(f"  note: {text}", soft_wrap=True, highlight=False, markup=False)
+                    bars.console.print(f"  note: {text}", soft_wrap=True, highlight=False)
                 case StateEvent(state=state):
                     bars.update(task, description=state, left="")
         job = JobView.model_validate(client.get(job_url))
@@ -58,13 +58,13 @@ def rehearsal_report(found: Rehearsal) -> None:
     if found.ended is not None:
         ended = found.ended
         text = f"rehearsal on {name}: {ended.reason.value}\n{ended.detail}. {ended.advice}"
-        terminal.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        terminal.console.print(text, highlight=False, soft_wrap=True)
     figures = found.result.model_dump() | {"plant_time_s": sum(found.plant_time_s.values())}
     if found.result.new_gains is not None:
         shown = ShownResult.model_validate(figures)
         result_table(shown, None if found.ended else f"rehearsal on {name}", "rehearsed", mv_unit="MV unit")
     if found.ended is None and found.result.comparison is not None:
-        terminal.console.print(found.result.comparison.verdict, markup=False, highlight=False)
+        terminal.console.print(found.result.comparison.verdict, highlight=False)
 
 
 def job_report(job: JobView, pv_unit: str = "PV unit") -> None:
@@ -77,10 +77,10 @@ def job_report(job: JobView, pv_unit: str = "PV unit") -> None:
     heading_new = {JobState.NO_GAIN: "designed", JobState.REHEARSED: "rehearsed"}.get(job.state, "after")
     result_table(ShownResult.model_validate(job), None if in_words else title(job), heading_new, pv_unit)
     if job.comparison and not job.reason:
-        terminal.console.print(job.comparison.verdict, markup=False, highlight=False)
+        terminal.console.print(job.comparison.verdict, highlight=False)
     if on := job.rehearsed_on:
         text = f"Rehearsed on {on.plant_text}; {on.gains_text}. Nothing was tested on the loop."
-        terminal.console.print(text, markup=False, highlight=False)
+        terminal.console.print(text, highlight=False)
     if job.watch is not None:
         for sentence in watch(job.watch):
             _say(sentence)
@@ -106,7 +106,7 @@ def _show_next_steps(job: JobView) -> None:
 
 def _say(text: str) -> None:
     """Shows a text whose lines are not broken: it can be copied."""
-    terminal.console.print(text, markup=False, highlight=False, soft_wrap=True)
+    terminal.console.print(text, highlight=False, soft_wrap=True)
 
 
 def next_steps(job: JobView) -> list[str]:
@@ -165,14 +165,14 @@ def loop_report(loop: LoopDetail) -> None:
         table.add_row(label, value, of)
     terminal.console.print(table)
     for sentence in knowledge(loop):
-        terminal.console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+        terminal.console.print(sentence, highlight=False, soft_wrap=True)
     if loop.watch is not None:
         for sentence in watch(loop.watch):
-            terminal.console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+            terminal.console.print(sentence, highlight=False, soft_wrap=True)
     if loop.live_error:
         error = loop.live_error
         text = f"The loop cannot be read: {error.detail}. {error.advice}"
-        terminal.console.print(text, highlight=False, markup=False)
+        terminal.console.print(text, highlight=False)
     if loop.not_confirmed_home:
         terminal.console.print(loop.not_confirmed_home.advice, highlight=False)
 

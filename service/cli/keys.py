@@ -90,7 +90,10 @@ class _Keys:
         from loopwright.service.store.keyring import Keyring
 
         if database is None and make:
-            data.mkdir(mode=0o700, parents=True, exist_ok=True)
+            try:
+                data.mkdir(mode=0o700, parents=True, exist_ok=True)
+            except OSError as error:
+                die(f"{data} cannot be the data folder of a service: {error.strerror}", 2)
         elif database is None and not (data / FILE).exists():
             die(f"{data} is not a data folder of a service: it has no {FILE}", 2)
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import re
 import sys
 from collections.abc import Mapping
@@ -57,9 +58,18 @@ def options(
 
 def main() -> None:
     try:
-        app()
+        try:
+            app()
+        finally:
+            print(end="", flush=True)
     except ApiError as error:
         print(f"loopwright: {error}", file=sys.stderr)
+        sys.exit(error.status)
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):
+            print(f"loopwright: {error}", file=sys.stderr)
+        # Python writes at its end what is left of the output, which failed here where a disk is full.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
@@ -404,9 +414,7 @@ def _previewed(
 
     alone: False where a question follows; the preview is then on standard error, and standard output is for the report.
     """
-    from rich.console import Console
-
-    from loopwright.service.cli import preview_tables
+    from loopwright.service.cli import preview_tables, terminal
     from loopwright.service.planning.preview import FleetPreview, Preview
 
     answer = client.post(f"{path}/preview", body)
@@ -415,7 +423,7 @@ def _previewed(
     if as_json:
         print_json(answer)
     else:
-        preview_tables.show(found, Console(stderr=not alone))
+        preview_tables.show(found, terminal.console if alone else terminal.progress_console)
     return found.would_start == (found.count if isinstance(found, FleetPreview) else True)
 
 

@@ -19,16 +19,16 @@ from loopwright.service.results import FindingSource, KnownGainsView
 def show(found: ObservationView, console: Console) -> None:
     """Shows what is known, from which changes, the gains and what speaks against them."""
     for line in _lines(found):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        console.print(line, highlight=False, soft_wrap=True)
     table = gains_table(found.present, found.proposed, f"% per {found.pv_unit}")
     for label, name, unit in (("overshoot", "overshoot_pct", "%"), ("settling", "settling_s", "s")):
         of_both = [None if each is None else getattr(each, name) for each in (found.predicted_before, found.predicted)]
         table.add_row(label, *map(cell, of_both), unit)
     console.print(table)
     if found.tried_text:
-        console.print(found.tried_text, highlight=False, markup=False)
-        console.print("What `retune` stands for:", highlight=False, markup=False)
-        console.print(json.dumps(found.retune), highlight=False, markup=False, soft_wrap=True)
+        console.print(found.tried_text, highlight=False)
+        console.print("What `retune` stands for:", highlight=False)
+        console.print(json.dumps(found.retune), highlight=False, soft_wrap=True)
 
 
 def _lines(found: ObservationView) -> list[str]:
@@ -80,7 +80,7 @@ def show_exported(found: ExportedView, console: Console) -> None:
         model = {name: getattr(found.model, name) for name in ("num", "den", "dead_time_s")}
         lines.append(f"Model ({found.model.structure}): {describe(model)}.")
     for line in lines:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        console.print(line, highlight=False, soft_wrap=True)
     console.print(gains_table(found.present, found.proposed, "OP per PV"))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from loopwright.service.cli.terminal import number
 from loopwright.service.planning.preview import FleetPreview, Preview, duration_text
@@ -40,9 +41,9 @@ def _stages(found: Preview, console: Console) -> None:
 
 def _obstacles(found: Preview, console: Console) -> None:
     if found.obstacles:
-        console.print(f"[bold]{found.loop} would be refused now[/bold]:", highlight=False)
+        console.print(Text.assemble((f"{found.loop} would be refused now", "bold"), ":"))
     for each in found.obstacles:
-        console.print(f"  {each.reason}: {each.detail}\n    {each.advice}", highlight=False, markup=False)
+        console.print(f"  {each.reason}: {each.detail}\n    {each.advice}", highlight=False)
 
 
 def _range(low: float | None, high: float | None, move: float) -> str:

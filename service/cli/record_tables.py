@@ -14,9 +14,9 @@ _NAMES = {"u": "MV", "y": "PV", "sp": "SP"}
 
 def read(record: Record) -> None:
     """Shows how many samples the record has, its length, the ranges of its columns, and what was changed."""
-    console.print(in_words(record), markup=False, highlight=False)
+    console.print(in_words(record), highlight=False)
     for note in record.notes:
-        console.print(f"note: {note}", markup=False, highlight=False)
+        console.print(f"note: {note}", highlight=False)
 
 
 def in_words(record: Record) -> str:

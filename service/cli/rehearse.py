@@ -63,7 +63,7 @@ def rehearse(
             found = stage_found(event.stage, to_json_object(event.result), "")
             text = f"{stage_name(event.stage)}: {found or 'done'}"
         if text is not None:
-            terminal.progress_console.print(f"  {text}", highlight=False, markup=False, soft_wrap=True)
+            terminal.progress_console.print(f"  {text}", highlight=False, soft_wrap=True)
 
     given = {
         "Ms": ms, "derivative": derivative or None, "aim": aim, "settling_s": settling_s, "mv_peak": mv_peak,

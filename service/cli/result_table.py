@@ -73,7 +73,7 @@ def result_table(
     if table.row_count > 1:  # the plant time alone is no result
         terminal.console.print(table)
         if shown.model_from is not None:
-            terminal.console.print(f"The model is from {shown.model_from}.", markup=False, highlight=False)
+            terminal.console.print(f"The model is from {shown.model_from}.", highlight=False)
 
 
 def weighted(*gains: GainsView | None) -> bool:

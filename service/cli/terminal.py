@@ -10,8 +10,9 @@ from pydantic import BaseModel
 from rich.console import Console
 from rich.table import Table
 
-console = Console()
-progress_console = Console(stderr=True)
+# What users have written is shown as it is: "[V-12]" is no style, and ":smile:" no picture.
+console = Console(markup=False, emoji=False)
+progress_console = Console(stderr=True, markup=False, emoji=False)
 
 
 def leaves(value: object, key: str = "") -> Iterator[tuple[str, int | float | str]]:

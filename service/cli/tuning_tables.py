@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 
 from rich import box
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
+from rich.text import Text
 
 from loopwright.service.api.tuning_views import AlternativesView, FiguresView, MarginsView, TunedView, TuningsView
 from loopwright.service.inputs.model_json import describe, dump_model
@@ -20,28 +20,33 @@ from loopwright.tuning.models import sign
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.registry import Method, Option
 
-console = Console(highlight=False)
+console = Console(highlight=False, markup=False, emoji=False)
 
 MAX_CANDIDATES = 8
+BOLD = "bold"
+_UNBOUNDED = 10_000
+"""More columns than any table has."""
 _COLUMNS = (
     ("Ms\n", "Ms", "margins"),
     ("GM\n", "GM", "margins"),
     ("PM\ndeg", "PM_deg", "margins"),
-    ("over-\nshoot, %", "overshoot_pct", "setpoint"),
+    ("over-\nshoot %", "overshoot_pct", "setpoint"),
     ("settling\ns", "settling_s", "setpoint"),
     ("IAE\nSP", "IAE", "setpoint"),
     ("peak\nload", "peak", "load"),
     ("IAE\nload", "IAE", "load"),
 )
+_LEFT_OUT = (6, 5, 2, 4, 1, 7, 3)
+"""The places of the columns that a terminal too narrow for all of them leaves out, the least needed first."""
 
 
 def methods(found: Iterable[Method]) -> None:
     """Shows what each method is for, the models that it takes, and its options."""
     for method in found:
-        console.print(f"[bold]{method.name}[/bold]  {method.title}")
-        console.print(f"  {escape(method.for_what)}\n  Takes {escape(method.needs)}.\n  {escape(method.source)}")
+        console.print(Text.assemble((method.name, BOLD), f"  {method.title}"))
+        console.print(f"  {method.for_what}\n  Takes {method.needs}.\n  {method.source}")
         for name, option in method.options.items():
-            console.print(f"    {name}: {escape(_option(option))}")
+            console.print(f"    {name}: {_option(option)}")
     console.print(
         "\n`loopwright tune --model ... --method NAME --option NAME=VALUE` uses one method; --method all compares all."
     )
@@ -54,20 +59,21 @@ def tunings(answer: TuningsView | AlternativesView, faceplate: Faceplate = ISA_I
     """
     tuned = [each for each in answer.methods if each.outcome == "tuned"]
     refused = [each for each in answer.methods if each.outcome == "refused"]
-    console.print(f"Model {escape(describe(answer.model.model_dump()))}")
+    console.print(f"Model {describe(answer.model.model_dump())}")
     first = answer.recommended if isinstance(answer, TuningsView) else None
     if tuned:
-        console.print(_table(tuned, faceplate, first.method if first else None))
+        left_out = _show_figures(tuned, faceplate, first.method if first else None)
+        if left_out:
+            console.print(f"A wider terminal, and --json, also show {', '.join(left_out)}.")
         console.print(
             f"Controller {EQUATIONS[faceplate.form]}; overshoot and settling (to 2 %) of "
             "a step of the set-point; IAE and peak for unit steps of the set-point and of the load at the plant's "
             "input, with these gains on the model with its exact dead time; an ideal derivative is filtered first.",
-            markup=False,
         )
         if sign(answer.model.plant()) < 0.0:
             console.print("The plant's gain is negative: the controller acts directly. Kp is given positive.")
     if first:
-        console.print(f"\n[bold]* {first.method}[/bold] is recommended: {escape(first.reason)}.")
+        console.print(Text.assemble(("\n* " + first.method, BOLD), f" is recommended: {first.reason}."))
     if refused:
         _refusals(refused)
     if len(tuned) == 1 and faceplate == ISA_IN_S:
@@ -81,17 +87,34 @@ def tunings(answer: TuningsView | AlternativesView, faceplate: Faceplate = ISA_I
         _hanging([(", ".join(who), note) for note, who in notes.items()])
 
 
-def _table(tuned: Sequence[TunedView], faceplate: Faceplate, recommended: str | None) -> Table:
+def _show_figures(tuned: Sequence[TunedView], faceplate: Faceplate, recommended: str | None) -> list[str]:
+    """Shows the gains and figures of each method, and returns the names of the figures for which there is no place."""
+    whole = console.options.update(width=_UNBOUNDED)
+    shown = list(_COLUMNS)
+    table = _table(tuned, faceplate, recommended, shown)
+    for place in _LEFT_OUT:
+        if console.measure(table, options=whole).maximum <= console.width:
+            break
+        shown.remove(_COLUMNS[place])
+        table = _table(tuned, faceplate, recommended, shown)
+    console.print(table)
+    names = [heading for heading, name, part in _COLUMNS if (heading, name, part) not in shown]
+    return [name.replace("-\n", "").replace("\n", " ").strip() for name in names]
+
+
+def _table(
+    tuned: Sequence[TunedView], faceplate: Faceplate, recommended: str | None, shown: Sequence[tuple[str, str, str]]
+) -> Table:
     """The gains and figures of each method, with the units in the second line of the headings."""
-    table = Table("method", box=None, padding=(0, 0, 0, 1), pad_edge=False)
+    table = Table(Column("method", no_wrap=True), box=None, padding=(0, 0, 0, 1), pad_edge=False)
     for name, unit in faceplate.columns:
-        table.add_column(f"{name}\n{unit}", justify="right")
+        table.add_column(f"{name}\n{unit}", justify="right", overflow="fold")
     weighted = any(each.gains is not None and each.gains.b != 1.0 for each in tuned)
-    for heading in (*["b"] * weighted, *(heading for heading, _, _ in _COLUMNS)):
-        table.add_column(heading, justify="right")
+    for heading in (*["b"] * weighted, *(heading for heading, _, _ in shown)):
+        table.add_column(heading, justify="right", overflow="fold")
     for each in tuned:
         parts = {"margins": each.margins, "setpoint": each.setpoint, "load": each.load}
-        cells = [_cell(name, _figure(parts[part], name)) for _, name, part in _COLUMNS]
+        cells = [_cell(name, _figure(parts[part], name)) for _, name, part in shown]
         if each.margins is None or not each.margins.stable:
             cells = ["unstable", *[""] * (len(cells) - 1)]
         numbers = None if each.gains is None else faceplate.numbers(each.gains.gains())
@@ -99,7 +122,7 @@ def _table(tuned: Sequence[TunedView], faceplate: Faceplate, recommended: str | 
         if weighted:
             gains.append("-" if each.gains is None else short(each.gains.b))
         mark = "* " if each.method == recommended else ""
-        table.add_row(f"{mark}{each.method}", *gains, *cells, style="bold" if mark else None)
+        table.add_row(f"{mark}{each.method}", *gains, *cells, style=BOLD if mark else None)
     return table
 
 
@@ -141,13 +164,13 @@ def to_try(found: AlternativesView) -> None:
     console.print(
         f"\nTo try them on the loop: loopwright retune {found.loop} --from {found.job} {wanted}\n"
         f"or POST /loops/{found.loop}/retune with\n{json.dumps(body)}",
-        markup=False, soft_wrap=True,
+        soft_wrap=True,
     )  # fmt: skip
 
 
 def not_identified(refusal: Refused) -> None:
     """Shows why no model was identified."""
-    console.print(f"[bold]{refusal.reason.value}[/bold]: {escape(refusal.detail)}\n{refusal.advice}")
+    console.print(Text.assemble((refusal.reason.value, BOLD), f": {refusal.detail}\n{refusal.advice}"))
 
 
 def identified(found: Identified, samples: int) -> None:
@@ -156,10 +179,10 @@ def identified(found: Identified, samples: int) -> None:
     samples: the number of samples of the record.
     """
     model, parameters = dump_model(found.model), named(found.parameters)
-    console.print(f"Model {escape(describe(model))}")
+    console.print(f"Model {describe(model)}")
     table = Table("", "value", "standard error", box=box.SIMPLE_HEAD, pad_edge=False)
     for name, error in named(found.standard_errors).items():
-        table.add_row(escape(name), number(parameters[name]), number(error))
+        table.add_row(name, number(parameters[name]), number(error))
     console.print(table)
     white = "explains the record" if found.explained else "does not explain all of the record"
     console.print(
@@ -178,9 +201,9 @@ def identified(found: Identified, samples: int) -> None:
     console.print(table)
     if len(found.candidates) > MAX_CANDIDATES:
         console.print(f"{len(found.candidates)} candidate models were fitted; --json has them all.")
-    console.print("For `loopwright tune --model`: " + json.dumps(model), markup=False, soft_wrap=True)
+    console.print("For `loopwright tune --model`: " + json.dumps(model), soft_wrap=True)
     for note in found.notes:
-        console.print(f"note: {note}", markup=False)
+        console.print(f"note: {note}")
 
 
 def _disturbance(candidate: Candidate) -> str:
@@ -227,5 +250,5 @@ def _hanging(lines: list[tuple[str, str]]) -> None:
     grid.add_column(max_width=24)
     grid.add_column()
     for left, right in lines:
-        grid.add_row(escape(left), escape(right))
+        grid.add_row(left, right)
     console.print(grid)

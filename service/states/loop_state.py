@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from pydantic import JsonValue, TypeAdapter
 
-from loopwright.protocol.real32 import same
+from loopwright.protocol.real32 import TOLERANCE, same
 from loopwright.service.errors import Conflict
 from loopwright.service.jsonable import JsonObject, json_object, number
 from loopwright.tuning.gains import Gains
@@ -54,7 +55,12 @@ def differences(state: LoopState, home: LoopState) -> dict[str, str]:
 
 
 def same_gains(one: Gains, other: Gains) -> bool:
-    return all(same(getattr(one, name), getattr(other, name)) for name in Gains.__dataclass_fields__)
+    """Whether the gains are the same as far as REAL32 tells. Kp is compared by the ratio alone: where PV has a large
+    span, Kp is smaller than what counts as 0 elsewhere."""
+    others = (name for name in Gains.__dataclass_fields__ if name != "Kp")
+    return math.isclose(one.Kp, other.Kp, rel_tol=TOLERANCE) and all(
+        same(getattr(one, name), getattr(other, name)) for name in others
+    )
 
 
 _LOOP_STATE = TypeAdapter(LoopState)

@@ -103,7 +103,11 @@ def test_pages_have_each_decision_once(service: Service, client: TestClient) -> 
     assert seen == ["rollback", "accept", "retune"]
 
 
-@pytest.mark.parametrize("query", ["from=yesterday", "from=2026-01-31T12:00:00", "limit=0", "cursor=x"])
+@pytest.mark.parametrize(
+    "query",
+    ["from=yesterday", "from=2026-01-31T12:00:00", "from=0001-01-01T00:00:00%2B23:59",
+     "from=9999-12-31T23:59:59-23:59", "limit=0", "cursor=x"],
+)  # fmt: skip
 def test_what_is_refused(client: TestClient, query: str) -> None:
     assert client.get(f"/decisions?{query}").status_code == 422
 

@@ -15,7 +15,7 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner, Result
 
-from loopwright.service.cli import jobs, terminal
+from loopwright.service.cli import jobs, loops, terminal
 from loopwright.service.cli import main as cli
 from loopwright.service.cli.client import ApiError, Client
 from loopwright.tuning.plan import Mode
@@ -69,7 +69,7 @@ class Through:
 @pytest.fixture
 def through(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> Through:
     through = Through(client)
-    for module in (cli, jobs):
+    for module in (cli, jobs, loops):
         monkeypatch.setattr(module, "Client", lambda _url: through)
     return through
 
@@ -307,6 +307,14 @@ def test_ids_and_times_are_whole_on_eighty_columns(service: Service, through: Th
     state = service.store.get(job).state
     assert job in run("jobs", "--state", state).output and job not in run("jobs", "--state", "queued").output
     assert run("jobs", "--state", "nonsense").exit_code == 2
+
+
+def test_what_users_write_is_shown_as_they_wrote_it(service: Service, through: Through) -> None:
+    reason = "valve [/out] of order, see [V-12] [red]:smile:"
+    through.post(f"/loops/{TAG}/lock", {"reason": reason})
+    shown = run("loop", TAG)
+    assert shown.exit_code == 0 and all(word in shown.output for word in reason.split())
+    assert run("loops").exit_code == 0
 
 
 def test_how_long_ago() -> None:

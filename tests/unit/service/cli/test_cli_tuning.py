@@ -22,6 +22,7 @@ from loopwright.tuning.models import Reals, TransferFunction
 from loopwright.tuning.reasons import Reason
 from loopwright.tuning.rules.registry import METHODS
 from tests.rehearsal.test_observe import LAG, PI, TS, changes, operated
+from tests.unit.service.cli.columns import columns
 
 MODELS = {
     "lag-dominant": '{"K": 2, "T_s": 50, "L_s": 2}',
@@ -50,6 +51,19 @@ def strict(text: str) -> Any:
         raise AssertionError(f"{constant} is not JSON")
 
     return json.loads(text, parse_constant=no)
+
+
+@pytest.mark.parametrize("width", [80, 60, 44])
+def test_a_narrow_terminal_leaves_figures_out_and_cuts_none(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+    columns(monkeypatch, width)
+    model = '{"K": -1e-9, "T_s": 3e-6, "L_s": 1e-6}'
+    rows = run("tune", "--model", model).stdout.split("Controller Kp")[0].splitlines()[1:]
+    assert max(map(len, rows)) <= width and not any("…" in row for row in rows)
+    simc = next(row.split() for row in rows if row.startswith("simc "))
+    assert simc[1:5] == ["1.5e+09", "3e-06", "0", "1.59"]
+    said = " ".join(" ".join(rows).split())
+    assert "A wider terminal, and --json, also show" in said and "IAE SP" in said
+    assert run("tune", "--model", MODELS["lag-dominant"]).stdout.count("A wider terminal") == (width < 80)
 
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
@@ -456,3 +470,11 @@ def test_a_plant_file_with_a_key_twice_is_refused(tmp_path: Path, command: list[
     result = run(*command, str(file))
     assert result.exit_code == 2 and result.stdout == ""
     assert result.stderr == f"loopwright: {file}: gains.Kp: this key is given twice: leave one of them out\n"
+
+
+def test_an_output_that_takes_nothing_is_said_in_a_sentence() -> None:
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(
+            [sys.executable, "-m", "loopwright.service", "methods"], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert ended.returncode == 1 and ended.stderr == "loopwright: [Errno 28] No space left on device\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import httpx
 import pytest
 
 from loopwright.service.cli import client as client_module
-from loopwright.service.cli.client import ApiError, Client
+from loopwright.service.cli.client import ApiError, Client, NotSent
 
 
 def through(
@@ -142,3 +143,42 @@ def test_it_does_not_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ApiError, match="still being answered"):
         client.post("/a")
     assert len(sent) < 40
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [httpx.Response(200, html="<html>"), httpx.Response(200, content=b""), httpx.Response(404, json=["nothing here"])],
+    ids=["a page", "nothing", "a list"],
+)
+def test_another_program_at_the_address_is_named_as_such(
+    monkeypatch: pytest.MonkeyPatch, answer: httpx.Response
+) -> None:
+    for asked in (lambda client: client.get("/loops"), lambda client: client.pages("/loops")):
+        client, _ = through(monkeypatch, answer)
+        with pytest.raises(ApiError, match=r"http://gateway/loops is no Loopwright service \(HTTP .*--url"):
+            asked(client)
+
+
+def test_pages_are_lists(monkeypatch: pytest.MonkeyPatch) -> None:
+    client, _ = through(monkeypatch, httpx.Response(200, json={}))
+    with pytest.raises(ApiError, match="is no Loopwright service"):
+        client.pages("/loops")
+
+
+@pytest.mark.parametrize(
+    ("body", "why"),
+    [({"ms": math.nan, "T95_s": 60.0}, "^ms: a finite number"), ({"reason": "\udcff"}, "no UTF-8")],
+    ids=["no number", "no text"],
+)
+def test_what_cannot_be_sent_is_not_sent(monkeypatch: pytest.MonkeyPatch, body: dict[str, object], why: str) -> None:
+    client, sent = through(monkeypatch)
+    with pytest.raises(NotSent, match=why) as raised:
+        client.post("/loops/TIC-101/retune", body)
+    assert raised.value.status == 2 and not sent
+
+
+@pytest.mark.parametrize("key", ["ключ", "abc\n"])
+def test_a_key_that_cannot_be_one_is_blamed_on_the_key(monkeypatch: pytest.MonkeyPatch, key: str) -> None:
+    monkeypatch.setenv("LOOPWRIGHT_KEY", key)
+    with pytest.raises(NotSent, match="LOOPWRIGHT_KEY has characters that no key has"):
+        Client("http://gateway")
