@@ -11,6 +11,7 @@ import threading
 from contextlib import suppress
 
 from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
 
 from loopwright.service.errors import Stopping
 from loopwright.service.inputs.config import LoopConfig
@@ -33,7 +34,8 @@ from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.states.job_state import ACTIVE, IllegalMove, JobState
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.lock import CHECK_S
-from loopwright.service.store.store import FolderInUse, Store, WithJob
+from loopwright.service.store.store import FolderInUse, NoSuchJob, Store, WithJob
+from loopwright.service.store.tables import JobRow
 from loopwright.tuning.reasons import Reason
 
 log = logging.getLogger(__name__)
@@ -177,18 +179,30 @@ class Jobs:
         if self.stopping:
             raise Stopping(self.why_stopping)
         asked = request.asked()
-        row = self.store.create(tag, asked, request.requested_by, request.dry_run, host, WORKFLOW_VERSION, also)
+        made: list[Job] = []
+
+        def make(session: Session, row: JobRow) -> None:
+            if also is not None:
+                also(session, row)
+            made.append(Job.from_row(row))
+
         try:
+            row = self.store.create(tag, asked, request.requested_by, request.dry_run, host, WORKFLOW_VERSION, make)
             self.engine.enqueue(row.id, self._rehearsals(host) if row.dry_run else self._queue(config, host))
         except Exception:
-            # The caller is told that the start failed, so the job must not begin later.
-            self.registry.unqueued[row.id] = row
-            self._end_unqueued()
+            # The caller is told that the start failed, so the job must not begin later. It may be stored even where
+            # that has failed: the answer to the COMMIT alone may be lost.
+            for job in made:
+                self.registry.unqueued[job.id] = job
+                self._end_unqueued(job.id)
             raise
         return row
 
-    def _end_unqueued(self) -> None:
-        """Ends the jobs that could not be queued, as far as the database accepts it."""
+    def _end_unqueued(self, latest: str | None = None) -> None:
+        """Ends the jobs that could not be queued, as far as the database accepts it.
+
+        latest: the job whose start has just failed. Where it is not found yet, its COMMIT may still be under way.
+        """
         for job_id, row in list(self.registry.unqueued.items()):
             try:
                 if row.host == self.store.host:
@@ -196,6 +210,9 @@ class Jobs:
                 else:  # its own host may have found and begun it; only that host knows
                     with suppress(IllegalMove):
                         self.store.request_stop(job_id, Reason.INTERNAL, "service")
+            except NoSuchJob:
+                if job_id != latest:
+                    self.registry.unqueued.pop(job_id, None)
             except SQLAlchemyError as error:
                 log.error(
                     "job %s of loop %s could not be queued, and its end could not be written: it does not begin, and "

@@ -19,7 +19,7 @@ class Registry:
         self.stopping = False
         self.why_stopping = "the service is shutting down"
         self.running: dict[str, Running] = {}
-        # By id: jobs that could not be queued, as the caller was told, and whose end could not be stored either.
+        # By id: jobs that could not be stored or queued, as the caller was told, and whose end is not stored yet.
         self.unqueued: dict[str, Job] = {}
         # Guards the registry of running jobs and `stopping`.
         self.lock = threading.Lock()

@@ -1,0 +1,112 @@
+"""The connection breaks after a COMMIT was done and before its answer has come, as in a failover of the server."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy.exc import OperationalError
+from sqlalchemy.orm import Session
+
+from loopwright.service.inputs.request import FastRetune
+from loopwright.service.store.jobs import Job
+from loopwright.service.store.store import NoSuchJob, Store
+from tests.unit.service.api.test_api import assert_problem
+from tests.unit.service.fakes import TAG, Service
+
+Patch = pytest.MonkeyPatch
+
+
+class LosesAnswers:
+    """Loses the answer to the next COMMIT of a store. kept: whether that transaction was committed."""
+
+    def __init__(self, store: Store, patch: Patch) -> None:
+        self._writing = store.writing
+        self._next: bool | None = None
+        patch.setattr(store, "writing", self._losing)
+
+    def lose_next(self, kept: bool = True) -> None:
+        self._next = kept
+
+    @property
+    def lost(self) -> bool:
+        return self._next is None
+
+    @contextmanager
+    def _losing(self) -> Iterator[Session]:
+        with self._writing() as session:
+            yield session
+            kept, self._next = self._next, None
+            if kept is False:
+                self._lose()
+        if kept:
+            self._lose()
+
+    @staticmethod
+    def _lose() -> None:
+        raise OperationalError("COMMIT", {}, Exception("server closed the connection unexpectedly"))
+
+
+@pytest.fixture
+def answers(service: Service, monkeypatch: Patch) -> LosesAnswers:
+    return LosesAnswers(service.store, monkeypatch)
+
+
+def test_a_retune_that_was_answered_with_503_does_not_begin_by_itself(
+    service: Service, client: TestClient, answers: LosesAnswers
+) -> None:
+    answers.lose_next()
+    assert_problem(client.post(f"/loops/{TAG}/retune", json={}), 503)
+    assert answers.lost
+    for _ in range(3):
+        service.jobs.reconcile()
+    (row,) = service.store.recent()
+    assert (row.state, row.reason, row.detail) == ("failed", "internal", "it could not be queued")
+    assert not service.tune.inside.is_set() and not service.jobs.registry.unqueued
+    again = client.post(f"/loops/{TAG}/retune", json={})
+    assert again.status_code == 202
+    service.wait(again.json()["id"])
+    assert service.store.get(again.json()["id"]).state == "proposed"
+
+
+def test_nor_does_one_whose_commit_is_seen_only_later(
+    service: Service, answers: LosesAnswers, monkeypatch: Patch
+) -> None:
+    """The server may still be at the COMMIT when the job is looked for at once."""
+
+    def not_yet(job_id: str) -> Job:
+        raise NoSuchJob(job_id)
+
+    answers.lose_next()
+    with monkeypatch.context() as patch, pytest.raises(OperationalError):
+        patch.setattr(service.store, "get", not_yet)
+        service.jobs.start(TAG, FastRetune())
+    (row,) = service.store.unfinished()
+    service.jobs.worker.work(row.id)  # by an engine that has it, from wherever
+    assert service.store.get(row.id).state == "queued" and not service.tune.inside.is_set()
+    service.jobs.reconcile()
+    assert service.store.get(row.id).state == "failed" and not service.jobs.registry.unqueued
+
+
+def test_a_retune_of_another_host_is_stopped_there(service: Service, answers: LosesAnswers, monkeypatch: Patch) -> None:
+    monkeypatch.setattr(service.jobs.directory, "owner", lambda tag: (service.loops[TAG], "gateway B"))
+    answers.lose_next()
+    with pytest.raises(OperationalError):
+        service.jobs.start(TAG, FastRetune())
+    (row,) = service.store.recent()
+    assert (row.state, row.stop_reason, row.host) == ("queued", "internal", "gateway B")
+
+
+@pytest.mark.parametrize("host", [None, "gateway B"])
+def test_a_retune_that_was_not_committed_is_forgotten(
+    service: Service, answers: LosesAnswers, monkeypatch: Patch, host: str | None
+) -> None:
+    if host is not None:
+        monkeypatch.setattr(service.jobs.directory, "owner", lambda tag: (service.loops[TAG], host))
+    answers.lose_next(kept=False)
+    with pytest.raises(OperationalError):
+        service.jobs.start(TAG, FastRetune())
+    service.jobs.reconcile()
+    assert not service.store.recent() and not service.jobs.registry.unqueued
