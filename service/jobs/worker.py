@@ -9,6 +9,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import asdict
+from typing import Unpack
+
+from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.errors import Locked
 from loopwright.service.execution.procedures import Hooks, Outcome, Rehearse, Tune
@@ -35,7 +38,7 @@ from loopwright.service.loops.restoration import restore_abandoned
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.planning.known_loop import known
 from loopwright.service.planning.t95 import t95_mismatch
-from loopwright.service.states.job_state import ACTIVE, GOOD, JobState, state_after
+from loopwright.service.states.job_state import ACTIVE, GOOD, IllegalMove, JobState, state_after
 from loopwright.service.states.loop_state import LoopState, differences, loop_state, same_gains, state_json
 from loopwright.service.store import looked_after
 from loopwright.service.store.jobs import Job, JobColumns
@@ -208,7 +211,7 @@ class Worker:
             columns: JobColumns = {"old_gains": asdict(state.gains), "found": state_json(state)}
             if row.found is None:
                 columns["attempt"] = 1
-                self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, **columns))
+                self._move(row.id, JobState.RUNNING, **columns)
             else:
                 self._lasting(lambda: self.store.note(row.id, **columns))
                 self._resumed(row, "the loop had not been touched")
@@ -223,7 +226,7 @@ class Worker:
 
     def _dry(self, running: Running, row: Job, config: LoopConfig, request: RetuneRequest) -> Outcome:
         if row.state is JobState.QUEUED:
-            self._lasting(lambda: self.store.move(row.id, JobState.RUNNING, attempt=1))
+            self._move(row.id, JobState.RUNNING, attempt=1)
         else:
             self._resumed(row, "a rehearsal begins anew")
 
@@ -234,6 +237,26 @@ class Worker:
         ground = self._lasting(lambda: known(self.store, row.loop, lambda: self._directory.present(row.loop)))
         hooks = Hooks(on_event, running.on_samples, lambda: running.stop_reason, ground=ground)
         return self._rehearse(config, request, hooks)
+
+    def _move(self, job_id: str, wanted: JobState, **columns: Unpack[JobColumns]) -> Job:
+        """Moves a job of this thread, once. Where the connection broke before the answer, the job may be moved already:
+        nobody else on this host moves it then."""
+        broke = False
+
+        def move() -> Job:
+            nonlocal broke
+            try:
+                return self.store.move(job_id, wanted, **columns)
+            except SQLAlchemyError:
+                broke = True
+                raise
+            except IllegalMove:
+                job = self.store.get(job_id)
+                if not broke or (job.state, job.host) != (wanted, self.store.host):
+                    raise
+                return job
+
+        return self._lasting(move)
 
     def _resumed(self, row: Job, text: str) -> None:
         details = {"attempt": row.attempt + 1, "text": text}
@@ -264,7 +287,7 @@ class Worker:
         if outcome.ended is not None:
             state = state_after(outcome.ended)
             columns |= {"reason": outcome.ended.reason.value, "detail": outcome.ended.detail}
-        job = self._lasting(lambda: self.store.move(running.job_id, state, **columns))
+        job = self._move(running.job_id, state, **columns)
         self._lasting(lambda: self._operation.outdated(job, self.store.events(job.id)))
         self._knowledge.tested(job, running.pv_range, running.mv_range)
         self._ended(job)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import queue
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
@@ -11,10 +13,13 @@ from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from loopwright.service.inputs.request import FastRetune
+from loopwright.service.states.job_state import JobState
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import NoSuchJob, Store
+from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.service.api.test_api import assert_problem
 from tests.unit.service.fakes import TAG, Service
+from tests.unit.service.processes import PATIENCE_S
 
 Patch = pytest.MonkeyPatch
 
@@ -52,6 +57,24 @@ class LosesAnswers:
 @pytest.fixture
 def answers(service: Service, monkeypatch: Patch) -> LosesAnswers:
     return LosesAnswers(service.store, monkeypatch)
+
+
+def lose_answer_to_move(store: Store, answers: LosesAnswers, patch: Patch, lost: JobState) -> None:
+    """The answer to the first move into that state is lost."""
+    move = store.move
+    to_lose = [lost]
+
+    def moves(job_id: str, wanted: JobState, *more: Any, **columns: Any) -> Job:
+        if wanted in to_lose:
+            to_lose.remove(wanted)
+            answers.lose_next()
+        return move(job_id, wanted, *more, **columns)
+
+    patch.setattr(store, "move", moves)
+
+
+def states(service: Service, job_id: str) -> list[str]:
+    return [event.data["state"] for event in service.store.events(job_id) if event.kind == "state"]
 
 
 def test_a_retune_that_was_answered_with_503_does_not_begin_by_itself(
@@ -110,3 +133,55 @@ def test_a_retune_that_was_not_committed_is_forgotten(
         service.jobs.start(TAG, FastRetune())
     service.jobs.reconcile()
     assert not service.store.recent() and not service.jobs.registry.unqueued
+
+
+@pytest.mark.parametrize("dry_run", [False, True])
+def test_a_job_that_is_running_already_goes_on(
+    service: Service, answers: LosesAnswers, monkeypatch: Patch, dry_run: bool
+) -> None:
+    lose_answer_to_move(service.store, answers, monkeypatch, JobState.RUNNING)
+    job_id = service.jobs.start(TAG, FastRetune(dry_run=dry_run)).id
+    service.wait(job_id)
+    row = service.store.get(job_id)
+    assert (row.state, row.attempt, row.detail) == ("rehearsed" if dry_run else "proposed", 1, None)
+    assert states(service, job_id) == ["queued", "running", row.state]
+
+
+@pytest.mark.parametrize("ends", [None, Refused(Reason.NO_RESPONSE, "PV did not move")])
+def test_what_follows_the_end_of_a_job_is_done(
+    service: Service, answers: LosesAnswers, monkeypatch: Patch, ends: Refused | None
+) -> None:
+    service.tune.ends = ends
+    state = JobState.PROPOSED if ends is None else JobState.REFUSED
+    lose_answer_to_move(service.store, answers, monkeypatch, state)
+    tested: list[Job] = []
+    ended: queue.Queue[Job] = queue.Queue()
+    monkeypatch.setattr(service.jobs.knowledge, "tested", lambda job, *_: tested.append(job))
+    monkeypatch.setattr(service.jobs.worker, "_ended", ended.put)
+    job_id = service.jobs.start(TAG, FastRetune()).id
+    job = ended.get(timeout=PATIENCE_S)
+    assert job == service.store.get(job_id) and job.state is state and tested == [job]
+    assert states(service, job_id) == ["queued", "running", state]
+
+
+@pytest.mark.parametrize("by", ["another attempt here", "another host"])
+def test_what_others_have_begun_is_not_taken_for_ones_own(
+    service: Service, answers: LosesAnswers, monkeypatch: Patch, by: str
+) -> None:
+    """Without a lost answer, or on another host, somebody else has the job."""
+    move = service.store.move
+
+    def faster(job_id: str, wanted: JobState, *more: Any, **columns: Any) -> Job:
+        if wanted is JobState.RUNNING and service.store.get(job_id).state is JobState.QUEUED:
+            if by == "another host":
+                answers.lose_next()
+                columns["host"] = "gateway B"
+                return move(job_id, wanted, *more, **columns)
+            move(job_id, wanted, *more, **columns)
+        return move(job_id, wanted, *more, **columns)
+
+    monkeypatch.setattr(service.store, "move", faster)
+    job_id = service.jobs.start(TAG, FastRetune()).id
+    service.wait(job_id)
+    row = service.store.get(job_id)
+    assert (row.state, row.reason) == ("failed", "internal") and not service.tune.inside.is_set()
