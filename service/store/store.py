@@ -523,26 +523,36 @@ def is_shown_as(state: JobState) -> ColumnElement[bool]:
 def event_of(
     job_id: str, kind: str, data: Mapping[str, object], plant_time_s: float, stage: str | None = None
 ) -> Write:
-    """An event, at the time it happened. stage: the one that the job has entered with it."""
+    """An event, at the time it happened, stored once. stage: the one that the job has entered with it."""
     at, details = now(), json_object(data)
+    seq = 0
 
     def write(session: Session) -> None:
+        nonlocal seq
         row = _find(session, job_id, lock=True)
+        stored = session.get(EventRow, (job_id, seq)) if seq else None
+        if stored is not None and (stored.at, stored.kind, stored.data) == (at, kind, details):
+            return  # only the answer to the COMMIT was lost
         row.plant_time_s = plant_time_s
         if stage is not None:
             row.stage = stage
-        append(session, job_id, kind, details, plant_time_s, at)
+        seq = append(session, job_id, kind, details, plant_time_s, at)
 
     return write
 
 
 def block_of(job_id: str, stage: str, samples: Sequence[Sample]) -> Write:
-    """A block of samples of one stage, packed now: a database that is away does not fill the memory."""
+    """A block of samples of one stage, stored once, packed now: a database that is away does not fill the memory."""
     first_t_s, count, data = samples[0].t, len(samples), sample_blocks.pack(samples)
+    seq = 0
 
     def write(session: Session) -> None:
-        seq = session.scalar(select(func.max(ChunkRow.seq)).where(ChunkRow.job_id == job_id)) or 0
-        session.add(ChunkRow(job_id=job_id, seq=seq + 1, stage=stage, first_t_s=first_t_s, count=count, data=data))
+        nonlocal seq
+        stored = session.get(ChunkRow, (job_id, seq)) if seq else None
+        if stored is not None and (stored.first_t_s, stored.data) == (first_t_s, data):
+            return  # only the answer to the COMMIT was lost
+        seq = 1 + (session.scalar(select(func.max(ChunkRow.seq)).where(ChunkRow.job_id == job_id)) or 0)
+        session.add(ChunkRow(job_id=job_id, seq=seq, stage=stage, first_t_s=first_t_s, count=count, data=data))
         session.flush()
 
     return write
@@ -645,12 +655,11 @@ def _audit_decision(
 
 def append(
     session: Session, job_id: str, kind: str, data: Mapping[str, object], plant_time_s: float, at: str | None = None
-) -> None:
-    """The next event of a job whose row this transaction has locked."""
-    seq = session.scalar(select(func.max(EventRow.seq)).where(EventRow.job_id == job_id)) or 0
+) -> int:
+    """The next event of a job whose row this transaction has locked. Returns its number."""
+    seq = 1 + (session.scalar(select(func.max(EventRow.seq)).where(EventRow.job_id == job_id)) or 0)
     session.add(
-        EventRow(
-            job_id=job_id, seq=seq + 1, at=at or now(), plant_time_s=plant_time_s, kind=kind, data=json_object(data)
-        )
+        EventRow(job_id=job_id, seq=seq, at=at or now(), plant_time_s=plant_time_s, kind=kind, data=json_object(data))
     )
     session.flush()
+    return seq

@@ -13,9 +13,11 @@ from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from loopwright.service.inputs.request import FastRetune
+from loopwright.service.jobs.journal import Journal
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store.jobs import Job
-from loopwright.service.store.store import NoSuchJob, Store
+from loopwright.service.store.store import NoSuchJob, Store, block_of, event_of
+from loopwright.tuning.plan import Sample
 from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.service.api.test_api import assert_problem
 from tests.unit.service.fakes import TAG, Service
@@ -185,3 +187,34 @@ def test_what_others_have_begun_is_not_taken_for_ones_own(
     service.wait(job_id)
     row = service.store.get(job_id)
     assert (row.state, row.reason) == ("failed", "internal") and not service.tune.inside.is_set()
+
+
+def test_reports_of_a_job_are_stored_once(store: Store, monkeypatch: Patch) -> None:
+    job_id = store.create("A", {}, "me", False).id
+    answers, journal = LosesAnswers(store, monkeypatch), Journal(store)
+    before, times = len(store.events(job_id)), [float(t) for t in range(12)]
+    for t in times:
+        if t % 3 == 0:  # as many as there happen to be then go in one transaction
+            assert journal.flush(PATIENCE_S)
+            answers.lose_next(kept=t % 6 == 0)
+        journal.put(block_of(job_id, "relay", [Sample(t, 50.0, 50.0, 40.0 + t / 3, 2)]))
+        journal.put(event_of(job_id, "note", {"text": f"at {t}", "figures": (t / 3, None)}, t, "relay"))
+    assert journal.flush(PATIENCE_S) and answers.lost
+    journal.close(1)
+    assert [block.first_t_s for block in store.blocks(job_id)] == times
+    assert [event.data["text"] for event in store.events(job_id)[before:]] == [f"at {t}" for t in times]
+    assert store.get(job_id).plant_time_s == times[-1]
+
+
+def test_an_event_whose_number_another_has_taken_is_stored_all_the_same(store: Store, monkeypatch: Patch) -> None:
+    """Another gateway asks for an abort between a transaction that was lost and its repetition."""
+    job_id = store.create("A", {}, "me", False).id
+    write = event_of(job_id, "note", {"text": "once"}, 1.0)
+    LosesAnswers(store, monkeypatch).lose_next(kept=False)
+    with pytest.raises(OperationalError), store.writing() as session:
+        write(session)
+    store.append(job_id, "abort_requested", {"by": "gateway B"}, 1.0)
+    for _ in range(2):
+        with store.writing() as session:
+            write(session)
+    assert [event.kind for event in store.events(job_id)] == ["state", "abort_requested", "note"]
