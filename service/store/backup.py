@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 import tempfile
@@ -31,6 +32,13 @@ def back_up(data: Path, target: Path, replace: bool = False) -> int:
     source = data / FILE
     if not source.exists():
         raise BackupProblem(f"{data} is not a data folder of a service: it has no {FILE}")
+    if os.path.lexists(target) and not target.is_file():
+        raise BackupProblem(f"{target} is not a file that a back-up may take the place of: name a new file")
+    if _is_of(data, target):
+        raise BackupProblem(
+            f"{target} is in the data folder {data}, or a link to a file there: a back-up would take the place of what "
+            "the service writes; name a file elsewhere"
+        )
     if target.exists() and not replace:
         raise BackupProblem(f"{target} exists already; --replace writes over it")
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".backup-") as folder:
@@ -79,6 +87,14 @@ def restore(source: Path, data: Path, replace: bool = False) -> tuple[int, Path 
         (made / FILE).chmod(0o600)
         put_in_place(made / FILE, data / FILE)
         return interrupted, aside
+
+
+def _is_of(data: Path, target: Path) -> bool:
+    """Returns whether a path is in a data folder, or is a link, symbolic or hard, to a file in it."""
+    folder = data.resolve()
+    if any(path.is_relative_to(folder) for path in (target.parent.resolve(), target.resolve())):
+        return True
+    return target.exists() and any(target.samefile(path) for path in folder.iterdir() if path.is_file())
 
 
 def _check(path: Path) -> None:

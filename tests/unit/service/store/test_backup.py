@@ -137,6 +137,64 @@ def test_no_service_starts_in_the_middle_of_a_restore(data: Path, tmp_path: Path
     assert tried
 
 
+def _in_the_folder(data: Path, elsewhere: Path) -> Path:
+    return data / "loopwright.sqlite"
+
+
+def _of_the_engine(data: Path, elsewhere: Path) -> Path:
+    return data / "engine.sqlite"
+
+
+def _through_a_link_to_the_folder(data: Path, elsewhere: Path) -> Path:
+    (elsewhere / "folder").symlink_to(data)
+    return elsewhere / "folder" / "loopwright.sqlite-wal"
+
+
+def _by_a_symlink(data: Path, elsewhere: Path) -> Path:
+    (elsewhere / "link").symlink_to(data / "loopwright.sqlite")
+    return elsewhere / "link"
+
+
+def _by_a_hard_link(data: Path, elsewhere: Path) -> Path:
+    (elsewhere / "link").hardlink_to(data / "loopwright.sqlite")
+    return elsewhere / "link"
+
+
+@pytest.mark.parametrize(
+    "where", [_in_the_folder, _of_the_engine, _through_a_link_to_the_folder, _by_a_symlink, _by_a_hard_link]
+)
+@pytest.mark.parametrize("replace", [False, True])
+def test_a_back_up_does_not_take_the_place_of_what_the_service_writes(
+    data: Path, tmp_path: Path, where: Any, replace: bool
+) -> None:
+    """Its service would go on writing into a file that has no name any more."""
+    store = Store(data)
+    file = (data / "loopwright.sqlite").stat().st_ino
+    there = sorted(data.iterdir())
+    with pytest.raises(BackupProblem, match="name a file elsewhere"):
+        back_up(data, where(data, tmp_path), replace)
+    later = store.create("L", {}, "me", False).id
+    store.close()
+    assert (data / "loopwright.sqlite").stat().st_ino == file and set(data.iterdir()) <= set(there)
+    store = Store(data)
+    assert store.get(later).loop == "L"
+    store.close()
+
+
+def test_a_back_up_replaces_nothing_but_a_file(data: Path, tmp_path: Path) -> None:
+    """A device node, such as /dev/null, is as little a file as a pipe is."""
+    Store(data).close()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "nowhere").symlink_to(tmp_path / "missing")
+    for name in ("pipe", "folder", "nowhere"):
+        target = tmp_path / name
+        before = target.lstat()
+        with pytest.raises(BackupProblem, match="is not a file that"):
+            back_up(data, target, replace=True)
+        assert (target.lstat().st_ino, target.lstat().st_mode) == (before.st_ino, before.st_mode)
+
+
 def _cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:20_000])
 
@@ -247,6 +305,8 @@ def test_the_commands(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert again.exit_code == 2 and "--replace" in again.stderr
     assert run("backup", file, "--data", data, "--replace").exit_code == 0
     assert run("backup", tmp_path / "no" / "folder", "--data", data).exit_code == 2
+    own = run("backup", data / "loopwright.sqlite", "--data", data, "--replace")
+    assert own.exit_code == 2 and "is in the data folder" in own.stderr
     assert run("restore", file, "--data", data).exit_code == 2
     done = run("restore", file, "--data", data, "--replace")
     assert done.exit_code == 0 and "1 job(s)" in done.stdout and "replaced-" in done.stdout
