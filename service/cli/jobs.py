@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 from urllib.parse import quote
 
 import typer
@@ -21,6 +21,9 @@ from loopwright.service.cli.output import (
 )
 from loopwright.service.cli.tuning import check_plot
 from loopwright.service.states.job_state import JobState
+
+if TYPE_CHECKING:
+    from loopwright.service.api.job_views import JobView
 
 app = typer.Typer()
 
@@ -143,6 +146,7 @@ def one_job(
     from loopwright.service.api.job_views import JobView
     from loopwright.service.cli import job_tables
 
+    check_plot(plot)
     client = Client(url)
     path = path_of(client, job_id)
     decisions = [name for name, wanted in (("abort", abort), ("accept", accept), ("rollback", rollback)) if wanted]
@@ -157,23 +161,26 @@ def one_job(
     job = JobView.model_validate(client.post(f"{path}/{decisions[0]}", given) if decisions else client.get(path))
     if follow:
         job = job_tables.follow(client, path)
-    if plot is not None:
-        from loopwright.service.cli.plots.job import NoPicture, job_picture
-
-        check_plot(plot)
-        unit = unit_of(client, job.loop)
-        try:
-            job_picture(plot, client.samples_of(job.url), job, unit)
-        except NoPicture as error:
-            die(str(error), 1)
-        except OSError as error:
-            die(f"{plot}: {error.strerror}", 2)
     if as_json:
         print_json(job.model_dump(mode="json"))
     elif decisions and job.state in (JobState.ACCEPTED, JobState.ROLLED_BACK):
         job_tables.decision_report(job, unit_of(client, job.loop))
     else:
         job_tables.job_report(job, unit_of(client, job.loop))
+    if plot is not None:  # last: what was decided is told whether or not there is a plot
+        _save_plot(plot, client, job)
+
+
+def _save_plot(plot: Path, client: Client, job: JobView) -> None:
+    """Writes the plot of a job; ends the command with status 1 where there is none, since the job is told already."""
+    from loopwright.service.cli.plots.job import NoPicture, job_picture
+
+    try:
+        job_picture(plot, client.samples_of(job.url), job, unit_of(client, job.loop))
+    except NoPicture as error:
+        die(str(error), 1)
+    except OSError as error:
+        die(f"{plot}: {error.strerror}", 1)
 
 
 @app.command("report")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
@@ -108,9 +110,17 @@ def one_thread() -> None:
 
 
 def check_plot(plot: Path | None) -> None:
-    """Ends the command before any work if the format of the plot is not supported."""
-    if plot is not None and plot.suffix.lower() not in PICTURES:
+    """Ends the command before any work if the format of the plot is not supported, its file cannot be written, or what
+    draws it is not installed."""
+    if plot is None:
+        return
+    if plot.suffix.lower() not in PICTURES:
         die(f"--plot must end in {', '.join(PICTURES)}, not {plot}", 2)
+    if not plot.parent.is_dir():
+        die(f"{plot}: {os.strerror(errno.ENOENT)}: make the folder {plot.parent} first, or name another", 2)
+    if plot.is_dir() or not os.access(plot if plot.exists() else plot.parent, os.W_OK):
+        die(f"{plot} cannot be written: name another file for --plot", 2)
+    import_module("matplotlib")
 
 
 def save(plot: Path, draw: Callable[..., None], *what: object) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,6 +20,7 @@ from typer.testing import CliRunner, Result
 from loopwright.service.cli import jobs, loops, terminal
 from loopwright.service.cli import main as cli
 from loopwright.service.cli.client import ApiError, Client
+from loopwright.service.cli.plots import job as job_plot
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import NoGain, Reason, Refused
 from tests.unit.service.fakes import TAG, FakeLoop, Service
@@ -346,6 +349,61 @@ def test_a_job_without_a_record_has_no_picture(service: Service, through: Throug
     service.wait(job)
     result = run("job", job, "--plot", str(tmp_path / "job.png"))
     assert result.exit_code == 1 and "neither a relay's record nor a set-point step" in result.output
+
+
+@pytest.fixture
+def proposed(service: Service, through: Through) -> str:
+    """The id of a job whose proposal waits for a decision, and which has no record to be drawn."""
+    job = through.post(f"/loops/{TAG}/retune")["id"]
+    service.wait(job)
+    assert service.store.get(job).state == "proposed"
+    through.paths.clear()
+    return str(job)
+
+
+@pytest.mark.parametrize("decision", ["--accept", "--rollback", "--abort"])
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [("job.gif", "--plot must end in .png"), ("none/job.png", "No such file"), ("folder.png", "cannot be written")],
+)
+def test_a_plot_that_cannot_be_written_is_said_before_anything_is_decided(
+    proposed: str, service: Service, through: Through, tmp_path: Path, decision: str, name: str, why: str
+) -> None:
+    (tmp_path / "folder.png").mkdir()
+    refused = run("job", proposed, decision, "--plot", str(tmp_path / name))
+    assert refused.exit_code == 2 and why in refused.output and name in refused.output
+    assert through.paths == [] and service.store.get(proposed).state == "proposed"
+
+
+def test_what_a_plot_needs_is_looked_for_before_anything_is_decided(
+    proposed: str, service: Service, through: Through, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    refused = run("job", proposed, "--accept", "--plot", str(tmp_path / "job.png"))
+    assert isinstance(refused.exception, ModuleNotFoundError) and refused.exception.name == "matplotlib"
+    assert through.paths == [] and service.store.get(proposed).state == "proposed"
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_decision_is_told_although_the_plot_fails(
+    proposed: str, service: Service, tmp_path: Path, as_json: bool
+) -> None:
+    told = run("job", proposed, "--accept", "--plot", str(tmp_path / "job.png"), *["--json"] * as_json)
+    assert service.store.get(proposed).state == "accepted"
+    assert told.exit_code == 1 and "neither a relay's record nor" in told.stderr and "accepted" in told.stdout
+    assert not as_json or json.loads(told.stdout)["id"] == proposed
+
+
+def test_a_decision_is_told_although_the_disk_is_full(
+    proposed: str, service: Service, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(job_plot, "job_picture", full)
+    told = run("job", proposed, "--accept", "--plot", str(tmp_path / "job.png"))
+    assert told.exit_code == 1 and "job.png: No space left on device" in told.stderr and "accepted" in told.stdout
+    assert service.store.get(proposed).state == "accepted"
 
 
 def test_rehearse_is_fast_unless_told_otherwise(tmp_path: Path) -> None:
