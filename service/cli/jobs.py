@@ -30,6 +30,8 @@ app = typer.Typer()
 LAST = "last"
 ID_LENGTH = 12
 """Number of characters of the id of a job; fewer are the beginning of an id."""
+_SURE = 4
+"""Number of characters of an id that a decision takes at least: fewer are a slip as easily as an id."""
 _FEW = 5
 JobId = Annotated[
     str,
@@ -46,6 +48,8 @@ def path_of(client: Client, given: str) -> str:
 
     from loopwright.service.api.job_views import JobView
 
+    if not given:
+        die("the id of the job is empty, as from a variable that is not set; see: loopwright jobs", 2)
     if given == LAST:
         wanted: dict[str, str | float | None] = {"limit": 1}
     elif len(given) < ID_LENGTH:
@@ -152,9 +156,12 @@ def one_job(
     decisions = [name for name, wanted in (("abort", abort), ("accept", accept), ("rollback", rollback)) if wanted]
     if len(decisions) > 1:
         die("only one of --abort, --accept and --rollback can be given", 2)
-    if job_id == LAST and (accept or rollback):  # somebody else's job may have begun meanwhile
+    short = len(job_id) < _SURE
+    if (accept or rollback) and (job_id == LAST or short):  # somebody else's job may have begun meanwhile
         found = JobView.model_validate(client.get(path))
-        die(f"--{decisions[0]} writes to a loop and takes an id: the last job is {found.id}, of {found.loop}", 2)
+        takes = f"at least {_SURE} characters of an id" if short else "an id"
+        which = f"{job_id} begins that of" if short else "the last job is"
+        die(f"--{decisions[0]} writes to a loop and takes {takes}: {which} {found.id}, of {found.loop}", 2)
     if not accept and not roll_back_by_itself:
         die("--no-roll-back-by-itself is for --accept", 2)
     given: dict[str, object] = {"by": "cli"} | ({"roll_back_by_itself": roll_back_by_itself} if accept else {})

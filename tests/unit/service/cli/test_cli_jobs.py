@@ -287,10 +287,37 @@ class TestWhichJob:
             begun = next(each[:n] for n in range(1, 13) if sum(other.startswith(each[:n]) for other in ids) == 1)
             assert json.loads(run("job", begun, "--json").stdout)["id"] == each
 
-    def test_the_beginning_of_several(self, ids: list[str]) -> None:
-        several = run("job", "")
+    def test_the_beginning_of_several(self, service: Service, through: Through) -> None:
+        by_digit: dict[str, list[str]] = {}
+        same: list[str] = []
+        while len(same) < 2:
+            job = service.store.create(f"L{sum(map(len, by_digit.values()))}", {}, "me", False).id
+            same = by_digit.setdefault(job[0], [])
+            same.append(job)
+        several = run("job", same[0][0])
         assert several.exit_code == 2 and "several jobs" in several.output
-        assert all(each in several.output for each in ids)
+        assert all(each in several.output for each in same)
+
+    @pytest.mark.parametrize("option", ["--accept", "--rollback", "--abort", "--json"])
+    def test_an_empty_id_is_that_of_no_job(
+        self, proposed: str, service: Service, through: Through, option: str
+    ) -> None:
+        """As an unset variable of the shell gives it; there is one job, which it must not mean."""
+        refused = run("job", "", option)
+        assert refused.exit_code == 2 and "the id of the job is empty" in refused.output
+        assert through.paths == [] and service.store.get(proposed).state == "proposed"
+        assert run("report", "").exit_code == run("retune", TAG, "--from", "", "--yes").exit_code == 2
+
+    @pytest.mark.parametrize("option", ["--accept", "--rollback"])
+    def test_a_decision_takes_four_characters_of_an_id(
+        self, proposed: str, service: Service, through: Through, option: str
+    ) -> None:
+        for short in (proposed[:1], proposed[:3]):
+            refused = run("job", short, option)
+            assert refused.exit_code == 2 and f"{proposed}, of {TAG}" in refused.output
+            assert through.paths == [] and service.store.get(proposed).state == "proposed"
+            assert run("job", short).exit_code == 0
+        assert run("job", proposed[:4], option).exit_code == 0
 
     @pytest.mark.parametrize("given", ["nope", "%", "_", "last "])
     def test_of_none(self, ids: list[str], given: str) -> None:
