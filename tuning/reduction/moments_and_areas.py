@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
-from scipy.linalg import companion, expm
+from scipy.linalg import companion, expm, matrix_balance
 
 from loopwright.tuning.models import FOPDT, Model, integrators, monic
 from loopwright.tuning.reasons import Reason, Refused
@@ -31,16 +31,25 @@ def two_areas(model: Model) -> FOPDT:
     """
     _require_self_regulating(model)
     mean, _ = _moments(model)
+    return fopdt_of_areas(model.static_gain, mean, _area_to(model, max(mean - model.L, 0.0)))
+
+
+def _area_to(model: Model, until: float) -> float:
+    """The integral of the step response without its dead time, divided by K, from 0 to `until`, s."""
     num, den = monic(model)
     order = len(den) - 1
+    # in units of `until`, and balanced: in seconds the coefficients of slow or of many lags are powers too far apart
+    unit = until ** np.arange(order + 1.0)
+    num, den = num * unit, den * unit
     # states of the plant, its step, and the integral of its output
     a = np.zeros((order + 2, order + 2))
     a[:order, :order] = companion(den)
     a[0, order] = 1.0
     a[order + 1, :order] = num[1:] - den[1:] * num[0]
     a[order + 1, order] = num[0]
-    until = max(mean - model.L, 0.0)
-    return fopdt_of_areas(model.static_gain, mean, float(expm(a * until)[-1, order]) / model.static_gain)
+    balanced, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    area = float(expm(balanced)[-1, order] * scale[-1] / scale[order])
+    return until * area / model.static_gain
 
 
 def fopdt_of_moments(K: float, mean: float, variance: float) -> FOPDT:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import decimal
 import math
 from typing import Any
 
@@ -35,6 +36,44 @@ def test_two_areas_in_closed_form() -> None:
     assert pytest.approx((1.0, T, 5.0 - T), rel=1e-9) == (model.K, model.T, model.L)
     recomputed = row("Two areas")["recomputed"]
     assert pytest.approx((recomputed["T"], recomputed["tau"]), abs=0.01) == (model.T, model.L)
+
+
+def area_of_lags(lags: list[float]) -> float:
+    """The area A1 of the step response of lags, all different, by partial fractions, in exact enough arithmetic."""
+    decimal.getcontext().prec = 80
+    exact = [decimal.Decimal(lag) for lag in lags]
+    A0 = area = sum(exact, decimal.Decimal(0))
+    for i, lag in enumerate(exact):
+        others = math.prod((lag - x for j, x in enumerate(exact) if j != i), start=decimal.Decimal(1))
+        area -= lag ** len(lags) / others * (1 - (-A0 / lag).exp())
+    return float(area)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize(
+    "lags",
+    [
+        [3.0, 2.5, 2.0, 1.5, 1.0, 0.8],
+        [1.0, 1.4, 2.0, 1.1, 0.9, 1.7, 1.25, 2.5],
+        [20.0, 3.0, 1.0],
+        [1000.0, 700.0, 3.0, 1.0, 0.02, 0.01],
+    ],
+)
+def test_two_areas_of_lags_in_any_unit_of_time(lags: list[float], unit: float) -> None:
+    den = np.array([1.0])
+    for lag in lags:
+        den = np.polymul(den, [unit * lag, 1.0])
+    found = two_areas(TransferFunction((-2.0,), tuple(den), 0.5 * unit))
+    T = math.e * area_of_lags(lags)
+    assert pytest.approx((-2.0, unit * T, unit * (sum(lags) + 0.5 - T)), rel=1e-9) == (found.K, found.T, found.L)
+
+
+@pytest.mark.parametrize("lag", [1e-6, 1e6])
+def test_two_areas_of_eight_equal_lags_in_any_unit_of_time(lag: float) -> None:
+    # A1 = 8^9 e^-8 / 8!
+    found = two_areas(TransferFunction((1.0,), tuple(np.poly([-1.0] * 8) * lag ** np.arange(8.0, -1.0, -1.0)), 0.0))
+    T = math.e * 8.0**9 * math.exp(-8.0) / math.factorial(8)
+    assert pytest.approx((lag * T, lag * (8.0 - T)), rel=1e-9) == (found.T, found.L)
 
 
 # Romasevych et al.: the plants G2, G3, G5 and the moments behind their printed classical settings
