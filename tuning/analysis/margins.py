@@ -20,6 +20,10 @@ from loopwright.tuning.models import Complexes, Model, Reals
 from loopwright.tuning.reasons import Reason, Refused
 
 POINTS_PER_DECADE = 600
+COARSE = 0.1
+"""The turn of the dead time between two points of the grid from which the peak may lie between them, rad."""
+CROSSINGS = 40
+"""The crossings that are looked at: of more, those with the largest gain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +34,7 @@ class Margins:
     PM_deg: the phase margin, degrees.
     Ms, Mt: the peaks of |1/(1+L)| and |L/(1+L)|.
     wc, wpc: the gain crossover and the phase crossover, rad/s.
-    ws: the frequency of the peak Ms, rad/s.
+    ws: the frequency of the peak Ms, rad/s; the highest one looked at where |1/(1+L)| is largest in the limit.
     bandwidth: the frequency at which |L/(1+L)| first falls to 1/sqrt(2) of its value at rest, rad/s.
     stable: whether the loop is stable, exactly (see `tuning.analysis.stability`). The other figures of an unstable loop
     describe the curve and are no margins.
@@ -71,29 +75,40 @@ def margins(model: Model, gains: Gains) -> Margins:
 
     w = _grid(model, N, D)
     L = loop(w)
+
+    def nearness(x: float) -> float:
+        return abs(1.0 + at(x))
+
+    ws, minimum = _min(nearness, w, int(np.argmin(np.abs(1.0 + L))))
+    turn = _turn(model, w, L, minimum) if stable else w[:0]
+    if len(turn) and np.min(np.abs(1.0 + loop(turn))) < minimum:
+        w = np.sort(np.concatenate((w, turn)))
+        L = loop(w)
+        ws, minimum = _min(nearness, w, int(np.argmin(np.abs(1.0 + L))))
     one_plus = np.abs(1.0 + L)
-    ws, minimum = _min(lambda x: abs(1.0 + at(x)), w, int(np.argmin(one_plus)))
     closed = np.abs(L) / one_plus
     _, mt = _min(lambda x: -abs(at(x) / (1.0 + at(x))), w, int(np.argmax(closed)))
 
     wpc, inverse_gm = None, 0.0
-    for x in _crossings(lambda v: loop(v).imag, w, L.imag, (L.real < 0.0)):
+    for x in _crossings(lambda v: loop(v).imag, w, L.imag, (L.real < 0.0), np.abs(L)):
         size = abs(at(x))
         # a stable loop may cross beyond -1 as well (conditional stability): less gain, not more, ends it there
         if size > inverse_gm and not (stable and size >= 1.0):
             wpc, inverse_gm = x, size
 
     wc, pm = None, None
-    for x in _crossings(lambda v: np.log(np.abs(loop(v))), w, np.log(np.abs(L)), np.ones(w.shape, dtype=bool)):
+    everywhere = np.ones(w.shape, dtype=bool)
+    for x in _crossings(lambda v: np.log(np.abs(loop(v))), w, np.log(np.abs(L)), everywhere, np.abs(L)):
         here = abs(float(np.degrees(np.angle(-at(x)))))
         if pm is None or here < pm:
             wc, pm = x, here
 
+    gain, nearest = _at_infinity(model, N, D)
     return Margins(
         GM=1.0 / inverse_gm if inverse_gm > 0.0 else None,
         PM_deg=pm,
-        Ms=1.0 / max(minimum, 1e-12),
-        Mt=-mt,
+        Ms=1.0 / max(min(minimum, nearest), 1e-12),
+        Mt=max(-mt, gain / max(nearest, 1e-12)),
         wc=wc,
         wpc=wpc,
         ws=ws,
@@ -126,7 +141,8 @@ def ultimate_point(model: Model) -> tuple[float, float]:
 
 
 def _grid(model: Model, N: Reals, D: Reals) -> Reals:
-    """The frequency grid, rad/s, from well below the slowest to well above the fastest corner of the loop."""
+    """The frequency grid, rad/s, from well below the slowest to well above the fastest corner of the loop, and to a
+    decade beyond the gain crossover where a high gain moves that farther up."""
     corners = [float(x) for x in np.abs(np.concatenate((np.roots(N), np.roots(D)))) if x > 0.0]
     kept = np.trim_zeros(D, "b")
     origin = len(D) - len(kept)
@@ -137,7 +153,29 @@ def _grid(model: Model, N: Reals, D: Reals) -> Reals:
         corners.append(1.0 / model.L)
     low, high = 1e-3 * min(corners), 1e2 * max(corners)
     points = int(POINTS_PER_DECADE * math.log10(high / low)) + 1
-    return np.asarray(np.geomspace(low, high, points))
+    w = np.asarray(np.geomspace(low, high, points))
+    # where the fastest part alone would cross; the points below stay as they are
+    end = 10.0 * float(abs(N[0] / D[0]) ** (1.0 / (len(D) - len(N)))) if len(D) > len(N) else 0.0
+    if end <= high:
+        return w
+    return np.concatenate((w, np.geomspace(high, end, int(POINTS_PER_DECADE * math.log10(end / high)) + 2)[1:]))
+
+
+def _turn(model: Model, w: Reals, L: Complexes, minimum: float) -> Reals:
+    """One turn of the dead time about the frequency where |L| comes nearest to 1, if the dead time turns faster there
+    than the grid and may bring L nearer to -1 than `minimum`; else nothing."""
+    fast = np.flatnonzero(w * (model.L * math.log(10.0) / POINTS_PER_DECADE) > COARSE)
+    distances = np.abs(1.0 - np.abs(L[fast]))
+    if not len(fast) or np.min(distances) >= minimum:
+        return w[:0]
+    return np.asarray(w[fast[np.argmin(distances)]] + np.linspace(-math.pi, math.pi, 100) / model.L)
+
+
+def _at_infinity(model: Model, N: Reals, D: Reals) -> tuple[float, float]:
+    """The limit of |L| at high frequency, and how near L comes to -1 there, which with dead time it does again and
+    again."""
+    ratio = float(N[0] / D[0]) if len(N) == len(D) else 0.0
+    return abs(ratio), abs(1.0 - abs(ratio)) if model.L > 0.0 else abs(1.0 + ratio)
 
 
 def _bandwidth(loop: Callable[[Reals], Complexes], w: Reals, closed: Reals, N: Reals, D: Reals) -> float | None:
@@ -154,14 +192,18 @@ def _bandwidth(loop: Callable[[Reals], Complexes], w: Reals, closed: Reals, N: R
     return float(brentq(excess, w[i - 1], w[i], xtol=1e-12 * float(w[i]), rtol=1e-12))
 
 
-def _crossings(f: Callable[[Reals], Reals], w: Reals, values: Reals, wanted: NDArray[np.bool_]) -> list[float]:
-    """The zeros of f between neighbouring grid points that are both wanted."""
+def _crossings(
+    f: Callable[[Reals], Reals], w: Reals, values: Reals, wanted: NDArray[np.bool_], sizes: Reals
+) -> list[float]:
+    """The zeros of f between neighbouring grid points that are both wanted, from the lowest up; of many, those where
+    the gain, `sizes`, is largest."""
     keep = wanted[:-1] & wanted[1:]
     at = np.flatnonzero((np.sign(values[:-1]) * np.sign(values[1:]) <= 0.0) & keep)
-    # beyond a few dozen turns of the dead time the loop gain has long decayed: the first crossings decide
+    if len(at) > CROSSINGS:
+        at = np.sort(at[np.argsort(-sizes[at], kind="stable")[:CROSSINGS]])
     return [
         float(brentq(lambda x: float(f(np.array([x]))[0]), w[i], w[i + 1], xtol=1e-12 * float(w[i]), rtol=1e-12))
-        for i in at[:40]
+        for i in at
         if values[i] != values[i + 1]
     ]
 

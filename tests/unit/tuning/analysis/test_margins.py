@@ -11,7 +11,7 @@ import pytest
 
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import FOPDT, TransferFunction
+from loopwright.tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.tuning.tables import EQUIPOLE5, GOLDEN, MODELS, TABLES, table4_model, transfer_function
 
@@ -88,6 +88,66 @@ def test_an_integral_loop_with_dead_time_in_closed_form() -> None:
 def test_the_sign_of_the_gain_is_the_action_of_the_controller() -> None:
     gains = Gains(Kp=0.9, Ti=7.5)
     assert margins(FOPDT(-2.0, 5.0, 2.5), gains) == margins(FOPDT(2.0, 5.0, 2.5), gains)
+
+
+@pytest.mark.parametrize("K", [2.0, 200.0, 1e5])
+def test_a_lag_without_dead_time_in_closed_form(K: float) -> None:
+    # K above 100 crosses beyond a hundred times the corner of the lag
+    found = margins(FOPDT(1.0, 100.0, 0.0), Gains(K))
+    wc = math.sqrt(K * K - 1.0) / 100.0
+    assert found.wc == pytest.approx(wc, rel=1e-9)
+    assert found.PM_deg == pytest.approx(180.0 - math.degrees(math.atan(100.0 * wc)), rel=1e-9)
+    assert found.bandwidth is not None and found.bandwidth > wc
+    assert found.Ms == 1.0 and found.GM is None and found.stable
+
+
+@pytest.mark.parametrize("K", [1e3, 1e5, 1e9])
+def test_two_lags_without_dead_time_in_closed_form(K: float) -> None:
+    # closed loop: (x^2 + 2x)/(x^2 + 2x + 1 + K) for x = 10 s, a peak of about sqrt(K)/2
+    found = margins(SOPDT.of_time_constants(1.0, 10.0, 10.0, 0.0), Gains(K))
+    wc = math.sqrt(K - 1.0) / 10.0
+    assert found.wc == pytest.approx(wc, rel=1e-9)
+    assert found.PM_deg == pytest.approx(180.0 - 2.0 * math.degrees(math.atan(10.0 * wc)), abs=1e-6)
+    v = np.linspace(K - 10.0, K + 10.0, 200_001)
+    peak = float(np.max(np.sqrt((v * v + 4.0 * v) / ((1.0 + K - v) ** 2 + 4.0 * v)))) if K < 1e6 else math.sqrt(K) / 2.0
+    assert found.Ms == pytest.approx(peak, rel=1e-3)
+
+
+@pytest.mark.parametrize("model", [FOPDT(1.0, 10.0, 0.0), Integrating(0.1, 0.0), SOPDT(1.0, 10.0, 2.0, 0.0)])
+@pytest.mark.parametrize("Kp", [0.01, 1.0, 50.0])
+def test_no_sensitivity_stays_below_its_limit(model: Any, Kp: float) -> None:
+    """The sensitivity of a loop that passes no jump on ends at 1."""
+    assert margins(model, Gains(Kp, 10.0)).Ms >= 1.0
+
+
+# (10 s + 1)/(0.1 s + 1) exp(-20 s): the gain rises to 100, where the dead time turns thousands of times
+LEAD = TransferFunction((10.0, 1.0), (0.1, 1.0), 20.0)
+
+
+def test_the_ultimate_gain_of_a_plant_whose_gain_rises_with_frequency() -> None:
+    Ku, _ = ultimate_point(LEAD)
+    assert pytest.approx(0.01, rel=1e-3) == Ku
+    assert margins(LEAD, Gains(0.999 * Ku)).stable
+    assert not margins(LEAD, Gains(1.001 * Ku)).stable
+
+
+def test_the_margins_of_a_plant_whose_gain_rises_with_frequency() -> None:
+    found = margins(LEAD, Gains(0.0099))
+    assert found.stable
+    assert pytest.approx(1.0 / 0.99, rel=1e-3) == found.GM
+    assert found.Ms == pytest.approx(1.0 / (1.0 - 0.99), rel=1e-6)
+    assert found.Mt == pytest.approx(0.99 / (1.0 - 0.99), rel=1e-6)
+
+
+def test_a_peak_between_two_turns_of_the_dead_time() -> None:
+    """At the frequency where |L| peaks the dead time turns by far more than a turn between two points of the grid."""
+    num = (456.2888784408331, -521.9964348631026, 37192.937532627744)
+    den = (1.0, 70.2718154765495, 2866.0848938997624, 16127.390414744712)
+    model, gains = TransferFunction(num, den, 74.75706292657354), Gains(0.1299614634492863)
+    found = margins(model, gains)
+    w = np.linspace(40.0, 70.0, 1_000_001)
+    peak = float(np.max(1.0 / np.abs(1.0 + gains.Kp * model.frequency_response(w))))
+    assert found.stable and found.Ms == pytest.approx(peak, rel=1e-3)
 
 
 def test_a_plant_without_ultimate_point_is_refused() -> None:
