@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from loopwright.service.inputs.validation import did_you_mean
 from loopwright.service.offline.csv_record.errors import Unusable
+from loopwright.service.offline.csv_record.time_units import SECONDS, unit_at_end
 
 NAMES = {
     "t": ("t", "time", "timestamp", "time stamp", "t_stamp", "datetime", "date time", "date/time", "date and time"),
@@ -22,7 +23,7 @@ _USUAL = {"t": 1, "u": 2, "y": 3, "sp": 4}
 """The number of the column of each quantity in the files that most people make."""
 _OPTIONAL = frozenset({"sp"})
 _UNIT = re.compile(r"^(?P<name>.*?)\s*[(\[{](?P<unit>[^)\]}]*)[)\]}]\s*$")
-_TIME_UNITS = re.compile(r"^(?P<name>t|time|timestamp)[_ ](?P<unit>ms|s|sec|min|h)$")
+_TIME_UNITS = re.compile(rf"^(?P<name>t|time|timestamp)(?:_|\s*[ ,/]\s*)(?P<unit>{'|'.join(SECONDS)})\.?$")
 _TAG = re.compile(r"[.:/_\s\\-]+")
 
 
@@ -46,7 +47,7 @@ class Columns:
 def split_unit(cell: str) -> tuple[str, str]:
     """Returns the name of a column in small letters, and its unit ("" where it has none)."""
     text = cell.strip()
-    if (found := _UNIT.match(text)) or (found := _TIME_UNITS.match(text.lower())):
+    if (found := _UNIT.match(text)) or (found := _TIME_UNITS.match(text.casefold())):
         return found["name"].strip().lower(), found["unit"].strip()
     return text.lower(), ""
 
@@ -81,6 +82,8 @@ def find_columns(header: Sequence[str], chosen: Mapping[str, str], line: int) ->
     if problems:
         raise Unusable(*problems)
     units = {quantity: split[place][1] for quantity, place in at.items() if split[place][1]}
+    if "t" in chosen and "t" not in units and (unit := unit_at_end(header[at["t"]])):
+        units["t"] = unit
     joined = date if "t" in at and at["t"] != date and names[at["t"]] in CLOCK and "t" not in chosen else None
     return Columns(at, header, units, joined, _only(names, MILLISECONDS))
 

@@ -6,9 +6,10 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from loopwright.service.offline.csv_record.columns import Columns, find_columns
+from loopwright.service.offline.csv_record.columns import NAMES, Columns, find_columns
 from loopwright.service.offline.csv_record.errors import Unusable, counted
 from loopwright.service.offline.csv_record.numbers import is_missing, number
+from loopwright.service.offline.csv_record.time_units import seconds_in
 
 DELIMITERS = (",", ";", "\t", " ")
 MAX_HEADER_LINES = 30
@@ -68,7 +69,7 @@ def read_table(text: str, chosen: Mapping[str, str]) -> Table:
     while described < min(MAX_UNIT_LINES, len(rows)) and not _is_sample(rows[described], columns):
         described += 1
     if described < len(rows):  # else nothing is a sample, and the errors of the cells say why
-        columns = replace(columns, units={**_units(rows[:described], columns), **columns.units})
+        columns = replace(columns, units=_units(rows[:described], columns))
         kept, rows = kept[described:], rows[described:]
     if not rows:
         raise Unusable(*problems or ["has column names but no samples"])
@@ -126,7 +127,23 @@ def _is_sample(cells: Sequence[str], columns: Columns) -> bool:
 
 
 def _units(rows: Sequence[Sequence[str]], columns: Columns) -> dict[str, str]:
+    """The units behind the names of the columns, else those in the lines below the names."""
     if not rows:
-        return {}
-    cells = {quantity: rows[0][place].strip().strip("[](){}") for quantity, place in columns.at.items()}
-    return {quantity: cell for quantity, cell in cells.items() if cell and len(cell) <= MAX_UNIT}
+        return dict(columns.units)
+    cells = {quantity: _bare(rows[0][place]) for quantity, place in columns.at.items() if quantity != "t"}
+    units = {quantity: cell for quantity, cell in cells.items() if cell and len(cell) <= MAX_UNIT}
+    units.update(columns.units)
+    if unit := _time_unit([columns.units.get("t", ""), *(_bare(row[columns.at["t"]]) for row in rows)]):
+        units["t"] = unit
+    return units
+
+
+def _time_unit(cells: Sequence[str]) -> str:
+    """The first known unit of time in cells of which some describe the column, else the first that may claim to be one,
+    whatever its length: an unknown unit must not be taken for s."""
+    said = [cell for cell in cells if cell and cell.lower() not in NAMES["t"]]
+    return next((cell for cell in said if seconds_in(cell) is not None), said[0] if said else "")
+
+
+def _bare(cell: str) -> str:
+    return cell.strip().strip("[](){}")

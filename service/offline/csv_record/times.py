@@ -17,9 +17,9 @@ import numpy as np
 
 from loopwright.service.offline.csv_record.errors import Unusable, counted
 from loopwright.service.offline.csv_record.numbers import numbers
+from loopwright.service.offline.csv_record.time_units import require_known, require_possible, seconds_in
 from loopwright.tuning.models import Reals
 
-_UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "min": 60.0, "h": 3600.0}
 _EPOCHS = ((1e18, 1e-9), (1e17, 1e-7), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))
 """Times from so large a number on count from an epoch, in units of so many s: ns, Windows' 100 ns, us, ms, s."""
 _SPREADSHEET_DAYS = (20000.0, 80000.0)
@@ -34,6 +34,8 @@ _MOMENT = re.compile(
     r"(?:(?P<hour>\d{1,2}):(?P<minute>\d{2})(?::(?P<second>\d{2})(?:[.,:](?P<fraction>\d{1,9}))?)?"
     r"\s*(?P<half>[AaPp]\.?\s?[Mm]\.?)?)?(?:\s*(?:UTC|GMT|Z))?$"
 )
+_MINUTES_FIRST = re.compile(r"^m{1,2}(?:in)?:s{1,2}(?:ec)?\b", re.IGNORECASE)
+"""The unit of times whose first part is not the hour."""
 _DAY = 86400.0
 
 Value = TypeVar("Value")
@@ -55,6 +57,8 @@ def seconds(cells: Sequence[str], lines: Sequence[int], unit: str, form: str | N
     first = cells[0].strip()
     if ":" not in first and not _has_date(first):
         return _of_numbers(cells, lines, unit, name)
+    if _MINUTES_FIRST.match(unit) and first.count(":") == 1:
+        cells = [f"0:{cell.strip()}" for cell in cells]
     try:
         return _from_first(np.array([_iso(cell) for cell in cells]))
     except ValueError:
@@ -108,8 +112,9 @@ def _of_numbers(cells: Sequence[str], lines: Sequence[int], unit: str, name: str
             raise Unusable(counted(places, f"{name} is missing", f"values of {name} are missing"))
         one = f"{name} is neither a number of s nor a date and time: {given!r}; --time-format says how it is written"
         raise Unusable(counted(places, one, f"values of {name} are not numbers as those before, such as {given!r}"))
-    if unit.lower() in _UNITS:
-        return np.asarray(times * _UNITS[unit.lower()])
+    if (size_s := seconds_in(unit)) is not None:
+        require_possible(float(times[0]) * size_s, unit, name)
+        return np.asarray(times * size_s)
     for smallest, size in _EPOCHS:
         if times[0] >= smallest:
             return _from_first(times) * size
@@ -117,6 +122,7 @@ def _of_numbers(cells: Sequence[str], lines: Sequence[int], unit: str, name: str
     steps = np.abs(np.diff(times))
     if low <= times.min() and times.max() < high and len(steps) and np.median(steps) < _SPREADSHEET_STEP:
         return _from_first(times) * _DAY
+    require_known(unit, name)
     return times
 
 

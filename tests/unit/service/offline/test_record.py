@@ -170,6 +170,55 @@ def test_times_as_systems_write_them(header: str, times: tuple[str, ...], found:
     assert seconds_of(header, *times) == pytest.approx(found, abs=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("unit", "s"),
+    [
+        ("ns", 1e-9), ("us", 1e-6), ("µs", 1e-6), ("\u03bcs", 1e-6), ("Microseconds", 1e-6), ("msec", 1e-3),
+        ("milliseconds", 1e-3), ("S", 1.0), ("sec.", 1.0), ("Seconds", 1.0), ("mins", 60.0), ("Min.", 60.0),
+        ("minutes", 60.0), ("hr", 3600.0), ("hrs", 3600.0), ("hours", 3600.0), ("d", 86400.0), ("Days", 86400.0),
+    ],
+)  # fmt: skip
+def test_units_of_time_in_words(unit: str, s: float) -> None:
+    for header in (f"Time ({unit})", f"time [{unit}]", f"Time_{unit}", f"time / {unit}"):
+        assert seconds_of(header, "0", "0.5", "1") == pytest.approx([0.0, 0.5 * s, s])
+    below = parse_record(f"Time;u;y\n({unit});%;degC\n0;1;2\n0.5;1;2\n", "log.csv")
+    assert values(below.t) == pytest.approx([0.0, 0.5 * s])
+    described = parse_record(f"Time;u;y\nTime;Valve;Temperature\n{unit};%;degC\n0;1;2\n0.5;1;2\n", "log.csv")
+    assert values(described.t) == pytest.approx([0.0, 0.5 * s])
+    for name in (f"Elapsed_{unit}", f"Zeit / {unit}", unit):
+        chosen = parse_record(f"{name};u;y\n0;1;2\n0.5;1;2\n", "log.csv", ReadOptions({"t": "1"}))
+        assert values(chosen.t) == pytest.approx([0.0, 0.5 * s])
+
+
+def test_a_unit_of_time_that_is_not_known_is_never_taken_for_s() -> None:
+    known = "which is not known; put one of ns, us, ms, s, min, h and d in its place, as in 'Time (min)'"
+    below = "Time;u;y\nticks of the PLC;%;degC\n0;1;2\n1;1;2\n"
+    for text, unit in (("Time (weeks);u;y\n0;1;2\n1;1;2\n", "weeks"), (below, "ticks of the PLC")):
+        with pytest.raises(RecordError) as caught:
+            parse_record(text, "log.csv")
+        assert f"has the unit '{unit}', {known}" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("header", "times", "found"),
+    [
+        ("Time (UTC)", ("0", "5"), [0.0, 5.0]),
+        ("Time (local)", ("0", "5"), [0.0, 5.0]),
+        ("Time (CET)", ("25.11.2026 10:00:00", "25.11.2026 10:00:05"), [0.0, 5.0]),
+        ("Time (since 1970)", ("1795600000", "1795600005"), [0.0, 5.0]),
+        ("Time (Excel)", ("46351.5", "46351.50005787037"), [0.0, 5.0]),
+        ("Time (mm:ss)", ("59:55", "59:57.5"), [3595.0, 3597.5]),
+    ],
+)
+def test_what_is_no_unit_of_time(header: str, times: tuple[str, ...], found: list[float]) -> None:
+    assert seconds_of(header, *times) == pytest.approx(found, abs=1e-4)
+
+
+def test_a_unit_of_time_that_cannot_be() -> None:
+    with pytest.raises(RecordError, match=r"begins at 1\.764e\+12 s, more than 3000 years, in the unit 's'; put one"):
+        seconds_of("time (s)", "1764000000000", "1764000005000")
+
+
 def test_a_time_format_that_is_given() -> None:
     text = "when;u;y\nday 330, 10h00;1;2\nday 330, 10h01;1;2\n"
     reading = ReadOptions({"t": "when"}, "day %j, %Hh%M")
