@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from loopwright.service.offline.csv_record.dates_as_numbers import are_days, compact_dates
 from loopwright.service.offline.csv_record.errors import Unusable, counted
 from loopwright.service.offline.csv_record.numbers import numbers
 from loopwright.service.offline.csv_record.time_units import require_known, require_possible, seconds_in
@@ -22,12 +23,6 @@ from loopwright.tuning.models import Reals
 
 _EPOCHS = ((1e18, 1e-9), (1e17, 1e-7), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))
 """Times from so large a number on count from an epoch, in units of so many s: ns, Windows' 100 ns, us, ms, s."""
-_SPREADSHEET_DAYS = (20000.0, 80000.0)
-"""Days that a spreadsheet counts from 1900 on, for dates from 1954 to 2119."""
-_SPREADSHEET_STEP = 0.005
-"""Largest time between samples, in days, for which numbers of that size are days: seven minutes.
-
-Of a clock in s it would be 200 samples a second."""
 _MONTHS = {name.lower(): i for i, name in enumerate(month_abbr) if name}
 _MOMENT = re.compile(
     r"^(?:(?P<a>\d{1,4})(?P<sign>[./\- ])(?P<b>\d{1,2}|[A-Za-z]{3,9})[./\- ](?P<c>\d{2,4})(?:[T, ]\s*|$))?"
@@ -103,6 +98,8 @@ def _each(
 
 
 def _of_numbers(cells: Sequence[str], lines: Sequence[int], unit: str, name: str) -> Reals:
+    if (moments := compact_dates(cells)) is not None:
+        return _from_first(moments)
     times, wrong = numbers(cells, decimal_comma=True)
     wrong = sorted({*wrong, *np.flatnonzero(np.isnan(times)).tolist()})
     if wrong:
@@ -118,9 +115,7 @@ def _of_numbers(cells: Sequence[str], lines: Sequence[int], unit: str, name: str
     for smallest, size in _EPOCHS:
         if times[0] >= smallest:
             return _from_first(times) * size
-    low, high = _SPREADSHEET_DAYS
-    steps = np.abs(np.diff(times))
-    if low <= times.min() and times.max() < high and len(steps) and np.median(steps) < _SPREADSHEET_STEP:
+    if are_days(times, cells, name):
         return _from_first(times) * _DAY
     require_known(unit, name)
     return times

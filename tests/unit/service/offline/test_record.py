@@ -155,6 +155,19 @@ def seconds_of(header: str, *times: str) -> list[float]:
         ("time", ("134400000000000000", "134400000005000000"), [0.0, 0.5]),  # 100 ns since 1601
         ("timestamp", ("46351.5", "46351.50005787037"), [0.0, 5.0]),  # days of a spreadsheet
         ("time", ("46351.5", "46351.55"), [46351.5, 46351.55]),  # s, twenty times a second
+        ("time", ("46351.00000000", "46351.01041667"), [0.0, 900.0003]),
+        ("time", ("46351,0000", "46351,0417", "46351,0833"), [0.0, 3602.88, 7197.12]),  # hours, to 9 s
+        ("time", ("46351.0", "46351.041666666664"), [0.0, 3600.0]),
+        ("time", ("46351.0", "46351.3333"), [0.0, 28797.12]),
+        ("time", ("740000.00000000", "740000.00347222"), [0.0, 299.9998]),  # MATLAB
+        ("time", ("20261125235955", "20261126000000", "20261126000005"), [0.0, 5.0, 10.0]),
+        ("time", ("202611252359", "202611260000", "202611260001"), [0.0, 60.0, 120.0]),
+        ("time", ("2026112523", "2026112600"), [0.0, 3600.0]),
+        ("time", ("20261125 235955", "20261126 000000,5"), [0.0, 5.5]),
+        ("time", ("20261125T235955", "20261126T000000"), [0.0, 5.0]),
+        ("time", ("20261125235959250", "20261126000000000"), [0.0, 0.75]),
+        ("time", ("2026112510", "2026112560"), [0.0, 50.0]),  # s since 1970: no hour 60
+        ("time", ("1979123123000", "1979123123500"), [0.0, 0.5]),  # ms since 1970
         ("time (ms)", ("200000000", "200000500"), [200000.0, 200000.5]),  # a counter of a PLC
         ("time", ("23:59:55", "00:00:00", "0:00:05"), [86395.0, 86400.0, 86405.0]),
         ("time", ("12:00:00 AM", "12:00:05 a.m."), [0.0, 5.0]),
@@ -212,6 +225,20 @@ def test_a_unit_of_time_that_is_not_known_is_never_taken_for_s() -> None:
 )
 def test_what_is_no_unit_of_time(header: str, times: tuple[str, ...], found: list[float]) -> None:
     assert seconds_of(header, *times) == pytest.approx(found, abs=1e-4)
+
+
+@pytest.mark.parametrize("times", [("46351", "46352"), ("46351.0", "46351.25"), ("46351.0", "46351.0333")])
+def test_numbers_that_may_be_days_or_s(times: tuple[str, str]) -> None:
+    with pytest.raises(RecordError, match=r"from 46351 on, .* apart: they may be days of a spreadsheet or s; put the"):
+        seconds_of("time", *times)
+    step = float(times[1]) - float(times[0])
+    for unit, s in (("d", 86400.0), ("s", 1.0)):
+        assert np.diff(seconds_of(f"time ({unit})", *times)) == pytest.approx([step * s])
+
+
+def test_date_and_time_apart_as_numbers() -> None:
+    text = "Date;Time;u;y\n20261125;235955;1;2\n20261126;000000;1;2\n"
+    assert values(parse_record(text, "log.csv").t) == [0.0, 5.0]
 
 
 def test_a_unit_of_time_that_cannot_be() -> None:
