@@ -46,7 +46,7 @@ class GatewayLost(Failed):
 
 
 class NotKnown(Exception):
-    """Whether a decision was carried out is not known; the text says how it becomes known."""
+    """What a decision or an abort has come to is not known; the text says how it becomes known."""
 
 
 class _OfOneReason(Refused):

@@ -13,7 +13,7 @@ from contextlib import suppress
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from loopwright.service.errors import Stopping
+from loopwright.service.errors import NotKnown, Stopping
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import RetuneRequest, check_setpoint_source, within
 from loopwright.service.jobs.active_job import Running
@@ -21,7 +21,7 @@ from loopwright.service.jobs.aftercare import Aftercare
 from loopwright.service.jobs.carrying_out import CarryingOut
 from loopwright.service.jobs.decisions import Decisions
 from loopwright.service.jobs.engine import WORKFLOW_VERSION, Engine
-from loopwright.service.jobs.journal import Journal
+from loopwright.service.jobs.journal import Journal, temporary
 from loopwright.service.jobs.locking import Locking
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
@@ -34,7 +34,7 @@ from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.states.job_state import ACTIVE, IllegalMove, JobState
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.lock import CHECK_S
-from loopwright.service.store.store import FolderInUse, NoSuchJob, Store, WithJob
+from loopwright.service.store.store import FolderInUse, NoSuchJob, Store, WithJob, stop_of
 from loopwright.service.store.tables import JobRow
 from loopwright.tuning.reasons import Reason
 
@@ -223,15 +223,30 @@ class Jobs:
                 self.registry.unqueued.pop(job_id, None)
 
     def abort(self, job_id: str, by: str) -> Job:
-        """Asks an active job to stop; it ends as aborted once the loop is restored. Raises IllegalMove.
+        """Asks an active job to stop; it ends as aborted once the loop is restored. Raises IllegalMove, NotKnown.
 
-        A job that runs here is asked before the abort is stored, so the loop does not wait for the database.
+        A job that runs here is asked before the abort is stored, so the loop does not wait for the database. While the
+        database does not take the abort of such a job, the abort waits in the journal.
         """
-        is_running_here = self.tell_to_stop(job_id)
-        row = self.store.request_stop(job_id, Reason.OPERATOR, by, is_running_here)
-        if row.host == self.store.host:
-            self._request_stop_of(job_id, Reason.OPERATOR)
-        return self.store.get(job_id)
+        heard = self.tell_to_stop(job_id)
+        try:
+            row = self.store.request_stop(job_id, Reason.OPERATOR, by, heard)
+        except SQLAlchemyError as error:
+            if not heard or not temporary(error):
+                raise
+            self.journal.put(stop_of(job_id, Reason.OPERATOR, by))
+        else:
+            if row.host == self.store.host and not heard:
+                self._request_stop_of(job_id, Reason.OPERATOR)
+        try:
+            return self.store.get(job_id)
+        except SQLAlchemyError as error:
+            if not heard or not temporary(error):
+                raise
+            raise NotKnown(
+                f"job {job_id} has been told to stop, and restores its loop; the database does not answer: what has "
+                "become of the job can be seen, and who has stopped it is stored, when the database is back"
+            ) from error
 
     def tell_to_stop(self, job_id: str) -> bool:
         """Asks a job that runs here to stop for an operator; returns at once, and stores nothing. Returns False where

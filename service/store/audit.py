@@ -21,13 +21,14 @@ def record(
     after: Mapping[str, object] | None = None,
     loop: str | None = None,
     said_by: str | None = None,
+    at: str | None = None,
 ) -> None:
     """Adds a row for the present principal. what: retune, abort, accept, rollback, key_create, ...; subject: the id of
-    the job or key."""
+    the job or key; at: when it was done, None for now."""
     who = current.get()
     session.add(
         AuditRow(
-            at=now(), who=who.name, key_id=who.key_id, address=who.address, gateway=who.gateway, said_by=said_by,
+            at=at or now(), who=who.name, key_id=who.key_id, address=who.address, gateway=who.gateway, said_by=said_by,
             what=what, subject=subject, loop=loop, before=before, after=after,
         )
     )  # fmt: skip

@@ -5,7 +5,8 @@ from __future__ import annotations
 import secrets
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from contextvars import Context
 from dataclasses import asdict
 from pathlib import Path
 from typing import Unpack
@@ -15,7 +16,8 @@ from sqlalchemy.exc import IntegrityError, SQLAlchemyError, TimeoutError
 from sqlalchemy.orm import Session
 
 from loopwright.service.jsonable import JsonObject, json_object, to_jsonable
-from loopwright.service.states.job_state import ACTIVE, MOVES, JobState, shown
+from loopwright.service.security.principal import current as principal
+from loopwright.service.states.job_state import ACTIVE, MOVES, IllegalMove, JobState, shown
 from loopwright.service.states.loop_state import gains_of, same_gains
 from loopwright.service.store import audit, claims, late, loop_locks, retunes, sample_blocks
 from loopwright.service.store.clock import now
@@ -53,6 +55,8 @@ DECISIONS = {JobState.ACCEPTED: "accept", JobState.ROLLED_BACK: "rollback"}
 _BEGUN = "decision_begun"
 """The event that a decision writes before it writes to the controller: only without it is a proposal known to have
 left the old gains in effect."""
+_CUT_SHORT = (JobState.ABORTED, JobState.FAILED)
+"""Ends of a job that was told to stop; `failed` where its loop could not be restored."""
 _BLOCKS_AT_ONCE = 16
 _JOBS_AT_ONCE = 100
 _ACTIVE = [state.value for state in ACTIVE]
@@ -376,16 +380,7 @@ class Store:
         heard: the job knows of this request already, and may have ended for it by now.
         """
         with self.writing() as session:
-            row = _find(session, job_id, lock=True)
-            ended_for_it = heard and (row.state, row.reason, row.stop_reason) == (JobState.ABORTED, reason, None)
-            if not ended_for_it:
-                _check(session, row, JobState.ABORTED)
-            claims.changed(session, f"/jobs/{job_id}")
-            if row.stop_reason is None:
-                row.stop_reason = reason
-                append(session, job_id, "abort_requested", {"by": by}, row.plant_time_s)
-                audit.record(session, "abort", job_id, before={"state": row.state}, loop=row.loop, said_by=by)
-            return Job.from_row(row)
+            return Job.from_row(_note_stop(session, job_id, reason, by, heard))
 
     def decision_failed(self, job_id: str, wanted: JobState, by: str, detail: str) -> None:
         """A decision that reached for the controller and ended in an error: its gains may have been written."""
@@ -541,6 +536,25 @@ def event_of(
     return write
 
 
+def stop_of(job_id: str, reason: Reason, by: str) -> Write:
+    """What `request_stop` notes of a request that its job has heard: by the present principal, at this time."""
+    at = now()
+
+    def write(session: Session) -> None:
+        with suppress(IllegalMove):  # the job had come to its own end when it heard
+            _note_stop(session, job_id, reason, by, heard=True, at=at)
+
+    return as_asked(write)
+
+
+def as_asked(write: Write) -> Write:
+    """The same write for the journal's thread: by the present principal, and with the present idempotency key."""
+    request = Context()
+    request.run(principal.set, principal.get())
+    request.run(claims.current.set, claims.current.get())
+    return lambda session: request.run(write, session)
+
+
 def block_of(job_id: str, stage: str, samples: Sequence[Sample]) -> Write:
     """A block of samples of one stage, stored once, packed now: a database that is away does not fill the memory."""
     first_t_s, count, data = samples[0].t, len(samples), sample_blocks.pack(samples)
@@ -613,6 +627,20 @@ def _check(session: Session, row: JobRow, wanted: JobState) -> None:
     present = shown(row.state, row.dry_run)
     if wanted not in MOVES[present]:
         raise late.too_late(row, present, wanted, _decided(session, row))
+
+
+def _note_stop(session: Session, job_id: str, reason: Reason, by: str, heard: bool, at: str | None = None) -> JobRow:
+    """at: when it was asked; None for now. Raises IllegalMove when the job is over, unless it may be so for this."""
+    row = _find(session, job_id, lock=True)
+    if not (heard and row.stop_reason is None and row.state in _CUT_SHORT):
+        _check(session, row, JobState.ABORTED)
+    claims.changed(session, f"/jobs/{job_id}")
+    if row.stop_reason is None:
+        row.stop_reason = reason
+        append(session, job_id, "abort_requested", {"by": by}, row.plant_time_s, at)
+        before = row.state if row.state in ACTIVE else JobState.RUNNING
+        audit.record(session, "abort", job_id, before={"state": before}, loop=row.loop, said_by=by, at=at)
+    return row
 
 
 def _decided(session: Session, row: JobRow) -> late.Decided | None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
 from loopwright.service.api.job_views import job_view
@@ -17,14 +18,20 @@ from loopwright.service.jobs.until_answered import STOP_PATIENCE_S
 from loopwright.service.loops.bus_restore import RESTORE_PATIENCE_S
 from loopwright.service.loops.loop import Restored
 from loopwright.service.results import ModelView, TransferModelView
+from loopwright.service.security.keys import Scope
+from loopwright.service.security.principal import Principal
+from loopwright.service.security.principal import current as principal
 from loopwright.service.states.job_state import IllegalMove, JobState
 from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store import audit
 from loopwright.service.store.jobs import Job
-from loopwright.service.store.store import Store
+from loopwright.service.store.store import Store, Write, now, stop_of
+from loopwright.service.store.tables import AuditRow
 from loopwright.tuning.plan import StageStarted
-from loopwright.tuning.reasons import Reason
+from loopwright.tuning.reasons import Failed, Reason
+from tests.unit.service.api.test_api import assert_problem
 from tests.unit.service.fakes import OLD, TAG, FakeLoop, Service
+from tests.unit.service.processes import until
 
 
 def test_stopping_ends_the_jobs_and_waits_for_their_loops(service: Service) -> None:
@@ -171,22 +178,124 @@ def test_samples_of_a_rehearsal_are_kept(service: Service) -> None:
     assert {"preflight", "relay", "verify"} <= set(stages)
 
 
+def away(*_: object) -> None:
+    raise OperationalError("UPDATE", {}, Exception("database is locked"))
+
+
+def running_one(service: Service) -> str:
+    """A job whose loop is under test."""
+    service.tune.hold.clear()
+    job_id = service.jobs.start(TAG, FastRetune()).id
+    assert service.tune.inside.wait(60)
+    return job_id
+
+
+def aborts(service: Service) -> list[AuditRow]:
+    return [each for each in audit.trail(service.store.engine, 100) if each.what == "abort"]
+
+
 def test_a_running_job_hears_of_an_abort_that_the_database_does_not_take(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def gone(*_: object) -> None:
-        raise OperationalError("UPDATE", {}, Exception("database is locked"))
-
-    service.tune.hold.clear()
-    row = service.jobs.start(TAG, FastRetune())
-    assert service.tune.inside.wait(60)
-    monkeypatch.setattr(service.store, "request_stop", gone)
-    with pytest.raises(OperationalError):
-        service.jobs.abort(row.id, "me")
-    service.wait(row.id)
-    row = service.store.get(row.id)
+    job_id = running_one(service)
+    monkeypatch.setattr(service.store, "request_stop", away)
+    service.jobs.abort(job_id, "me")
+    service.wait(job_id)
+    row = service.store.get(job_id)
     assert (row.state, row.reason) == ("aborted", Reason.OPERATOR.value)
     assert service.controller.state.gains == OLD
+
+
+def test_an_abort_that_the_database_does_not_take_is_written_once_when_it_does(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = running_one(service)
+    who = Principal("control room", Scope.OPERATE, "0123456789ab", "192.0.2.7")
+    with monkeypatch.context() as patch:
+        patch.setattr(service.store, "writing", away)
+        token = principal.set(who)
+        assert service.jobs.abort(job_id, "operator A").id == service.jobs.abort(job_id, "operator A").id == job_id
+        principal.reset(token)
+        asked = now()
+        until(lambda: service.jobs.journal.behind_s > 0, "reports that the database does not take")
+        assert aborts(service) == []
+    service.wait(job_id)
+    assert service.jobs.journal.flush(60)
+    row, (told,) = service.store.get(job_id), aborts(service)
+    assert (row.state, row.reason, row.stop_reason) == ("aborted", Reason.OPERATOR, Reason.OPERATOR)
+    assert (told.who, told.key_id, told.address) == (who.name, who.key_id, who.address)
+    assert (told.said_by, told.before, told.loop) == ("operator A", {"state": "running"}, TAG)
+    (event,) = [each for each in service.store.events(job_id) if each.kind == "abort_requested"]
+    assert event.data == {"by": "operator A"} and event.at <= asked and told.at <= asked
+
+
+def test_who_aborted_is_written_also_after_the_jobs_own_end(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its way out failed, and the journal comes after the end."""
+    job_id = running_one(service)
+    waiting: list[Write] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(service.store, "request_stop", away)
+        patch.setattr(FakeLoop, "restore", lambda *_: (_ for _ in ()).throw(Failed(Reason.NODE_LOST, "silent")))
+        patch.setattr(service.jobs.journal, "put", waiting.append)
+        service.jobs.abort(job_id, "me")
+        service.wait(job_id)
+    assert service.store.get(job_id).state == "failed"
+    for write in waiting:
+        service.jobs.journal.put(write)
+    assert service.jobs.journal.flush(60)
+    (told,) = aborts(service)
+    assert (told.said_by, told.before) == ("me", {"state": "running"})
+
+
+def test_a_job_that_came_to_its_own_end_has_no_abort_written_later(
+    service: Service, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    job_id = running_one(service)
+    service.tune.hold.set()
+    service.wait(job_id)
+    service.jobs.journal.put(stop_of(job_id, Reason.OPERATOR, "me"))
+    assert service.jobs.journal.flush(60)
+    assert aborts(service) == [] and service.store.get(job_id).stop_reason is None
+    assert "could not be written" not in caplog.text
+
+
+def test_an_abort_of_a_waiting_job_that_the_database_does_not_take_is_refused(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody has heard of it, so that it has to be asked again."""
+    row = service.store.create(TAG, {}, "me", False)
+    monkeypatch.setattr(service.store, "request_stop", away)
+    with pytest.raises(OperationalError):
+        service.jobs.abort(row.id, "me")
+
+
+def test_an_abort_while_the_database_answers_nothing_says_that_the_job_has_heard(
+    service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = running_one(service)
+    with monkeypatch.context() as patch:
+        patch.setattr(service.store, "request_stop", away)
+        patch.setattr(service.store, "get", away)
+        answer = client.post(f"/jobs/{job_id}/abort", json={"by": "me"})
+    detail = assert_problem(answer, 503)["detail"]
+    assert f"job {job_id} has been told to stop" in detail and answer.headers["retry-after"]
+    service.wait(job_id)
+    assert service.jobs.journal.flush(60)
+    assert [each.said_by for each in aborts(service)] == ["me"]
+
+
+def test_an_abort_that_waits_for_the_database_is_accepted_and_shown_later(
+    service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = running_one(service)
+    with monkeypatch.context() as patch:
+        patch.setattr(service.store, "writing", away)
+        assert client.post(f"/jobs/{job_id}/abort", json={"by": "operator A"}).status_code == 202
+    service.wait(job_id)
+    assert service.jobs.journal.flush(60)
+    shown = [(each["what"], each["by"]) for each in client.get("/decisions").json()]
+    assert shown.count(("abort", "operator A")) == 1
+    assert client.get(f"/jobs/{job_id}").json()["stopping"]["by"] == "operator A"
 
 
 def test_a_job_that_ends_for_an_abort_before_it_is_written_down_was_aborted_by_it(
@@ -203,7 +312,7 @@ def test_a_job_that_ends_for_an_abort_before_it_is_written_down_was_aborted_by_i
     assert service.tune.inside.wait(60)
     monkeypatch.setattr(service.store, "request_stop", slow)
     assert service.jobs.abort(row.id, "me").state == "aborted"
-    (told,) = [each for each in audit.trail(service.store.engine, 10) if each.what == "abort"]
+    (told,) = aborts(service)
     assert (told.subject, told.said_by) == (row.id, "me")
     with pytest.raises(IllegalMove):
         service.jobs.abort(row.id, "me")
