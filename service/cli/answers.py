@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import BaseModel, JsonValue
 
 from loopwright.service.api.job_views import LockView
+from loopwright.service.states.job_state import JobState
 
 
 class ProgressEvent(BaseModel):
@@ -48,6 +49,12 @@ def job_event(kind: str, data: object) -> ShownEvent | None:
     """Returns an event of GET /jobs/{id}/events; None for a kind that the commands do not show."""
     model = _EVENTS.get(kind)
     return None if model is None else model.model_validate(data)
+
+
+class JobAnswer(BaseModel):
+    """As much of a job as tells whether it is over."""
+
+    state: JobState
 
 
 class LockAnswer(BaseModel):

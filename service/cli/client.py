@@ -25,8 +25,14 @@ _COMPUTED_PATIENCE_S = 300.0
 where the processors are slow or tests have them first."""
 _SILENT_S = 15.0
 """Wall time after which a live stream that says nothing counts as cut off, s; it speaks about once a second."""
+_SILENT_EVENTS_S = 60.0
+"""Wall time after which the stream of a job that says nothing counts as cut off, s; it speaks every 15 s."""
 _AGAIN_S = 2.0
-"""Wall time between two attempts to reach the live stream, s."""
+"""Wall time between two attempts to reach a service that is followed, s."""
+_ABSENT_S = 60.0
+"""Wall time for which a service that is followed may be away, s: it starts again within it."""
+_AWAY = (502, 503, 504)
+"""Status of an answer, of the service or of a proxy before it, after which the same request may soon succeed."""
 
 _PERHAPS_CARRIED_OUT = "What was asked may have been carried out: look at the loop and its jobs before you repeat it."
 
@@ -44,6 +50,29 @@ class NotSent(ApiError):
     """What was to be sent can be no request."""
 
     status = 2
+
+
+class ServiceAway(ApiError):
+    """The service does not answer, or says that it cannot do so now."""
+
+
+class _Absence:
+    """For how long the service has been away."""
+
+    def __init__(self) -> None:
+        self._since: float | None = None
+
+    def over(self) -> None:
+        self._since = None
+
+    def wait(self, error: ServiceAway) -> None:
+        """Waits until the next attempt; raises ServiceAway after a minute without the service."""
+        now = time.monotonic()
+        if self._since is None:
+            self._since = now
+        if now - self._since >= _ABSENT_S:
+            raise ServiceAway(f"{error}\nIt was tried again for {_ABSENT_S:g} s.") from error
+        time.sleep(_AGAIN_S)
 
 
 class Client:
@@ -132,29 +161,44 @@ class Client:
                 return answer
             time.sleep(int(wait))
 
+    def awaited(self, path: str) -> object:
+        """As `get`, of a service that may be starting again: for a minute it is asked again."""
+        absence = _Absence()
+        while True:
+            try:
+                return self._there(path)
+            except ServiceAway as error:
+                absence.wait(error)
+
     def events(self, job_url: str) -> Iterator[tuple[str, object]]:
         """Yields the kind and the JSON of each event of a job until the job is over.
 
-        The stream resumes when the connection breaks.
+        The stream resumes when the connection breaks, and when the service has ended it before the job is over, as a
+        service that stops does. Raises ServiceAway when it does not resume within a minute.
         """
         import httpx
 
-        last, failures = "0", 0
+        from loopwright.service.cli.answers import JobAnswer
+        from loopwright.service.states.job_state import ACTIVE
+
+        last, absence = "0", _Absence()
         while True:
             try:
                 headers = {"Last-Event-ID": last}
-                timeout = httpx.Timeout(10.0, read=60.0)
+                timeout = httpx.Timeout(10.0, read=_SILENT_EVENTS_S)
                 with self._http.stream("GET", f"{job_url}/events", headers=headers, timeout=timeout) as answer:
-                    self._check(answer)
+                    self._check_there(answer)
+                    absence.over()
                     for fields in _events_of(answer):
                         last = fields.get("id", last)
-                        failures = 0
                         yield fields["event"], json.loads(fields["data"])
-                return
+                if JobAnswer.model_validate(self._there(job_url)).state not in ACTIVE:
+                    return
+                time.sleep(_AGAIN_S)
             except httpx.TransportError as error:
-                failures += 1
-                if failures > 3:
-                    raise ApiError(f"{self.url}: {error}") from error
+                absence.wait(self._no_answer(error, f"GET {job_url}/events", patience_s=_SILENT_EVENTS_S))
+            except ServiceAway as error:
+                absence.wait(error)
 
     def live(self, tag: str) -> Iterator[tuple[str, object]]:
         """Yields the name and the JSON of each message of the live stream about a loop, for ever. While the service is
@@ -206,7 +250,7 @@ class Client:
 
     def _no_answer(
         self, error: httpx.TransportError, asked: str, carried_out: str = "", patience_s: float = _PATIENCE_S
-    ) -> ApiError:
+    ) -> ServiceAway:
         import httpx
 
         if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
@@ -216,7 +260,21 @@ class Client:
             why = f"the service at {self.url} has not answered {asked} within {within_s:g} s; its log says why"
         else:
             why = f"the service at {self.url} broke the connection at {asked} ({error}); its log says why"
-        return ApiError(why + carried_out)
+        return ServiceAway(why + carried_out)
+
+    def _there(self, path: str) -> object:
+        answer = self._send("GET", path)
+        self._check_there(answer)
+        return _json(answer)
+
+    def _check_there(self, answer: httpx.Response) -> None:
+        """Raises ServiceAway where the service cannot answer now, ApiError where it refuses."""
+        try:
+            self._check(answer)
+        except ApiError as error:
+            if answer.status_code in _AWAY:
+                raise ServiceAway(str(error)) from error
+            raise
 
     @staticmethod
     def _check(answer: httpx.Response) -> None:

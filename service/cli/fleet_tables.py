@@ -18,7 +18,7 @@ def follow(client: Client, url: str, quiet: bool = False) -> object:
     """Shows how many loops are in which state until the retune is over; returns the JSON of the retune."""
     shown: dict[str, int] | None = None
     while True:
-        answer = client.get(url)
+        answer = client.awaited(url)
         found = FleetRetune.model_validate(answer)
         if found.counts != shown and not quiet:
             shown = found.counts

@@ -47,7 +47,7 @@ def follow(client: Client, job_url: str, to: Console | None = None) -> JobView:
                     bars.console.print(f"  note: {text}", soft_wrap=True, highlight=False)
                 case StateEvent(state=state):
                     bars.update(task, description=state, left="")
-        job = JobView.model_validate(client.get(job_url))
+        job = JobView.model_validate(client.awaited(job_url))
         bars.update(task, completed=job.progress)
     return job
 

@@ -17,6 +17,7 @@ from loopwright.service.cli.output import (
     AskedSettling,
     Url,
     die,
+    job_going_on,
     print_json,
 )
 from loopwright.service.cli.tuning import check_plot
@@ -167,7 +168,8 @@ def one_job(
     given: dict[str, object] = {"by": "cli"} | ({"roll_back_by_itself": roll_back_by_itself} if accept else {})
     job = JobView.model_validate(client.post(f"{path}/{decisions[0]}", given) if decisions else client.get(path))
     if follow:
-        job = job_tables.follow(client, path)
+        with job_going_on(job.id):
+            job = job_tables.follow(client, path)
     if as_json:
         print_json(job.model_dump(mode="json"))
     elif decisions and job.state in (JobState.ACCEPTED, JobState.ROLLED_BACK):

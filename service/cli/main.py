@@ -23,6 +23,8 @@ from loopwright.service.cli.output import (
     AskedSettling,
     Url,
     die,
+    going_on,
+    job_going_on,
     on_terminal,
     print_json,
     shown_on_terminal,
@@ -434,12 +436,15 @@ def _one(client: Client, started: object, wait: bool, as_json: bool) -> int:
     from loopwright.service.states.job_state import GOOD
 
     job = JobView.model_validate(started)
-    if wait and as_json:
-        for _ in client.events(job.url):
-            pass
-        job = JobView.model_validate(client.get(job.url))
-    elif wait:
-        job = job_tables.follow(client, job.url)
+    if wait:
+        print(f"job {job.id} of {job.loop}", file=sys.stderr)
+        with job_going_on(job.id):
+            if as_json:
+                for _ in client.events(job.url):
+                    pass
+                job = JobView.model_validate(client.awaited(job.url))
+            else:
+                job = job_tables.follow(client, job.url)
     if as_json:
         print_json(job.model_dump(mode="json"))
     else:
@@ -453,9 +458,13 @@ def _many(client: Client, started: object, wait: bool, as_json: bool) -> int:
     from loopwright.service.cli.answers import FleetRetune
     from loopwright.service.states.job_state import GOOD
 
-    url = FleetRetune.model_validate(started).url
-    answer = fleet_tables.follow(client, url, quiet=as_json) if wait else started
-    found = FleetRetune.model_validate(answer)
+    answer, found = started, FleetRetune.model_validate(started)
+    if wait:
+        print(f"retune {found.id} of {len(found.loops)} loops", file=sys.stderr)
+        ends = f"end it with: POST {client.url}{found.url}/abort"
+        with going_on(f"retune {found.id}", f"see it with: loopwright retunes, its jobs with: loopwright jobs, {ends}"):
+            answer = fleet_tables.follow(client, found.url, quiet=as_json)
+        found = FleetRetune.model_validate(answer)
     if as_json:
         print_json(answer)
     else:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import getpass
 import json
 import sys
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
 
 from loopwright.service.api import strict_json
+from loopwright.service.cli.client import ApiError
 
 Url = Annotated[str, typer.Option("--url", envvar="LOOPWRIGHT_URL", help="URL of the service.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
@@ -57,6 +60,24 @@ def shown_on_terminal() -> bool:
 def die(text: str, status: int) -> NoReturn:
     print(f"loopwright: {text}", file=sys.stderr)
     raise typer.Exit(status)
+
+
+@contextmanager
+def going_on(what: str, next_steps: str) -> Iterator[None]:
+    """Says how something is followed and ended further, where the command that follows it ends before it does: by
+    Ctrl-C, or because the service is away."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        die(f"{what} goes on; {next_steps}", 130)
+    except ApiError as error:
+        die(f"{error}\n{what} may go on; {next_steps}", 1)
+
+
+def job_going_on(job_id: str) -> AbstractContextManager[None]:
+    """As `going_on`, of a job."""
+    command = f"loopwright job {job_id}"
+    return going_on(f"job {job_id}", f"follow it with: {command} --follow, end it with: {command} --abort")
 
 
 def read_json_object(path: Path) -> dict[str, object]:

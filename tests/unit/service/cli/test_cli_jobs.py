@@ -19,7 +19,7 @@ from typer.testing import CliRunner, Result
 
 from loopwright.service.cli import jobs, loops, terminal
 from loopwright.service.cli import main as cli
-from loopwright.service.cli.client import ApiError, Client
+from loopwright.service.cli.client import ApiError, Client, ServiceAway
 from loopwright.service.cli.plots import job as job_plot
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import NoGain, Reason, Refused
@@ -41,7 +41,7 @@ class Through:
     def get(self, path: str, **query: Any) -> Any:
         return self._checked(self._client.get(path, params={k: v for k, v in query.items() if v is not None}))
 
-    computed = get
+    computed = awaited = get
     samples_of = Client.samples_of
     pages = Client.pages
     file = Client.file
@@ -345,6 +345,48 @@ def test_what_users_write_is_shown_as_they_wrote_it(service: Service, through: T
     shown = run("loop", TAG)
     assert shown.exit_code == 0 and all(word in shown.output for word in reason.split())
     assert run("loops").exit_code == 0
+
+
+class TestFollowing:
+    """A command that ends before what it follows says how it is followed further, and ended."""
+
+    @pytest.fixture(params=[KeyboardInterrupt(), ServiceAway("no service at http://gateway")], ids=["ctrl-c", "away"])
+    def ended(self, request: pytest.FixtureRequest, through: Through, monkeypatch: pytest.MonkeyPatch) -> BaseException:
+        error: BaseException = request.param
+
+        def end(_path: str) -> Iterator[tuple[str, dict[str, Any]]]:
+            raise error
+
+        monkeypatch.setattr(through, "events", end)
+        monkeypatch.setattr(through, "awaited", end)
+        return error
+
+    @staticmethod
+    def said(result: Result, error: BaseException, what: str) -> str:
+        by_hand = isinstance(error, KeyboardInterrupt)
+        assert result.exit_code == (130 if by_hand else 1), result.output
+        assert by_hand or "no service at http://gateway" in result.stderr
+        assert f"{what} {'goes on' if by_hand else 'may go on'}; " in result.stderr and result.stdout == ""
+        return result.stderr
+
+    @pytest.mark.parametrize("options", [(), ("--json",)])
+    def test_a_retune(self, service: Service, through: Through, ended: BaseException, options: tuple[str, ...]) -> None:
+        result = run("retune", TAG, "--yes", *options)
+        job = service.store.recent()[0].id
+        said = self.said(result, ended, f"job {job}")
+        assert said.startswith(f"job {job} of {TAG}\n")
+        assert f"loopwright job {job} --follow" in said and f"loopwright job {job} --abort" in said
+        service.wait(job)
+
+    def test_a_job(self, proposed: str, ended: BaseException) -> None:
+        assert f"{proposed} --follow" in self.said(run("job", proposed[:6], "--follow"), ended, f"job {proposed}")
+
+    def test_a_retune_of_many_loops(self, through: Through, ended: BaseException) -> None:
+        result = run("retune", "TIC-*", "--yes")
+        (retune,) = through.get("/retunes")
+        said = self.said(result, ended, f"retune {retune['id']}")
+        assert said.startswith(f"retune {retune['id']} of 1 loops\n")
+        assert f"{through.url}{retune['url']}/abort" in said and "loopwright retunes" in said
 
 
 def test_how_long_ago() -> None:

@@ -1,4 +1,5 @@
-"""The command line's client: a POST whose connection broke is repeated once, with the key it was sent with."""
+"""The command line's client: a POST whose connection broke is repeated once, with the key it was sent with; a job is
+followed over a restart of the service."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ import httpx
 import pytest
 
 from loopwright.service.cli import client as client_module
-from loopwright.service.cli.client import ApiError, Client, NotSent
+from loopwright.service.cli.client import ApiError, Client, NotSent, ServiceAway
 
 
 def through(
@@ -182,3 +183,59 @@ def test_a_key_that_cannot_be_one_is_blamed_on_the_key(monkeypatch: pytest.Monke
     monkeypatch.setenv("LOOPWRIGHT_KEY", key)
     with pytest.raises(NotSent, match="LOOPWRIGHT_KEY has characters that no key has"):
         Client("http://gateway")
+
+
+class TestFollowing:
+    """The stream of a job resumes over a restart of the service, which takes seconds."""
+
+    @staticmethod
+    def stream(*events: tuple[int, str]) -> httpx.Response:
+        said = "".join(f'id: {number}\nevent: note\ndata: {{"text": "{text}"}}\n\n' for number, text in events)
+        return httpx.Response(200, text=f"retry: 1000\n\n{said}: the service is stopping\n\n")
+
+    @staticmethod
+    def job(state: str) -> httpx.Response:
+        return httpx.Response(200, json={"id": "x", "state": state})
+
+    def test_over_a_restart(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        away = [httpx.ConnectError("refused")] * 10 + [httpx.Response(502, text="<html>"), httpx.ReadTimeout("late")]
+        client, sent = through(
+            monkeypatch, self.stream((1, "a"), (2, "b")), httpx.ReadError("reset"), *away,
+            self.stream((3, "c")), self.job("proposed"),
+        )  # fmt: skip
+        assert [data["text"] for _, data in client.events("/jobs/x")] == ["a", "b", "c"]  # type: ignore[index]
+        asked = [request.headers["last-event-id"] for request in sent if request.url.path == "/jobs/x/events"]
+        assert asked == ["0"] + ["2"] * 13
+
+    def test_a_stream_that_ends_before_its_job(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        client, sent = through(
+            monkeypatch, self.stream((1, "a")), self.job("running"), self.stream((2, "b")), self.job("aborted")
+        )
+        assert len(list(client.events("/jobs/x"))) == 2 and len(sent) == 4
+
+    def test_every_absence_has_a_minute_of_its_own(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        once = [*[httpx.ConnectError("refused")] * 25, self.stream((1, "a")), self.job("running")]
+        again = [*[httpx.ConnectError("refused")] * 25, self.stream((2, "b")), self.job("proposed")]
+        client, _ = through(monkeypatch, *once, *again)
+        assert len(list(client.events("/jobs/x"))) == 2
+
+    def test_not_for_ever(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        client, sent = through(monkeypatch, self.stream(), *[httpx.ConnectError("refused")] * 100)
+        with pytest.raises(ServiceAway, match=r"no service at http://gateway[^\n]*\nIt was tried again for 60 s"):
+            list(client.events("/jobs/x"))
+        assert len(sent) == 1 + 60 / 2.0 + 1  # the stream, then every 2 s, the first and the last included
+
+    def test_what_is_refused_is_said_at_once(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        for ask in (lambda client: list(client.events("/jobs/x")), lambda client: client.awaited("/jobs/x")):
+            client, sent = through(monkeypatch, httpx.Response(404, json={"detail": "no such job"}))
+            with pytest.raises(ApiError, match="no such job"):
+                ask(client)
+            assert len(sent) == 1
+
+    def test_an_answer_is_awaited_as_long(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        away = [httpx.ReadError("reset"), httpx.Response(503, json={"detail": "away"}), httpx.ConnectError("refused")]
+        client, _ = through(monkeypatch, *away, httpx.Response(200, json={"id": "x"}))
+        assert client.awaited("/jobs/x") == {"id": "x"}
+        client, _ = through(monkeypatch, *[httpx.ConnectError("refused")] * 100)
+        with pytest.raises(ServiceAway, match="for 60 s"):
+            client.awaited("/jobs/x")
