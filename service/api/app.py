@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 from typing import Annotated, Literal
@@ -99,6 +99,7 @@ def create_app(
     alarms: AlarmWatch | None = None,
     own: OwnGateway | None = None,
     others: OtherGateways | None = None,
+    streams_over: Callable[[], bool] = lambda: False,
 ) -> FastAPI:
     """The application for these jobs, which it stops when the server shuts down.
 
@@ -107,6 +108,7 @@ def create_app(
     what is stored.  live: None for a stream of its own.  figures: None for those that this pool computes when asked.
     alarms: None for one that looks only when it is asked.
     own, others: this gateway, and those that share its database; None for one without a URL.
+    streams_over: whether the streams of jobs are to end, although their jobs have not.
     """
 
     policy = policy or Policy()
@@ -280,7 +282,7 @@ def create_app(
         if over and last_event_id and not jobs.store.events(job_id, last_event_id, limit=1):
             return Response(status_code=204)
         permitted = still_permitted(keyring, policy.sessions, current.get())
-        stream = event_stream(jobs, job_id, last_event_id, permitted, elsewhere)
+        stream = event_stream(jobs, job_id, last_event_id, permitted, elsewhere, streams_over)
         return StreamingResponse(stream, media_type="text/event-stream", headers={"Cache-Control": "no-store"})
 
     @app.get(

@@ -47,16 +47,19 @@ async def event_stream(
     after: int,
     permitted: Callable[[], bool] = lambda: True,
     elsewhere: Callable[[Job], JobProgress | None] = lambda row: None,
+    over: Callable[[], bool] = lambda: False,
 ) -> AsyncIterator[str]:
-    """The events after number `after` as text/event-stream, until the job ends or `permitted` returns false.
+    """The events after number `after` as text/event-stream, until the job ends, `permitted` returns false, or `over`
+    returns true.
 
     elsewhere: how far a job of another gateway has come; None where it has not said so.
+    over: whether the service ends its streams; whoever resumes the stream at the next start misses nothing.
     """
     yield f"retry: {RETRY_MS}\n\n"
     sent = ""
     silent = 0
     asked = time.monotonic()
-    while True:
+    while not over():
         try:
             if time.monotonic() - asked > REVOKED_WITHIN_S:
                 if not await asyncio.to_thread(permitted):
@@ -73,12 +76,12 @@ async def event_stream(
             await asyncio.sleep(_AWAY_S)
             continue
         more = len(events) == _EVENTS_AT_ONCE
-        over = JobState(row.state) not in ACTIVE and not more
+        ended = JobState(row.state) not in ACTIVE and not more
         for event in events:
             after, silent = event.seq, 0
             data = {"at": event.at, "plant_time_s": event.plant_time_s, **event.data}
             yield f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"
-        if over:
+        if ended:
             return
         if more:
             continue
@@ -90,6 +93,7 @@ async def event_stream(
         if silent % _KEEP_ALIVE_POLLS == 0:
             yield ": alive\n\n"
         await asyncio.sleep(_POLL_S)
+    yield ": the service ends, and the job has not ended yet\n\n"
 
 
 def _progress(jobs: Jobs, job_id: str) -> str:

@@ -7,6 +7,7 @@ import gc
 import logging
 import os
 import socket
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -63,6 +64,9 @@ from loopwright.service.telemetry import logs
 from loopwright.service.telemetry.logs import LogFormat
 
 _GRACE_S = 10
+"""Wall time from the stop until requests that are not answered yet are cancelled, s."""
+STREAMS_GRACE_S = 8.0
+"""Wall time from the stop until the streams of jobs that have not ended are, s: before they would be cancelled."""
 _ONCE_A_MINUTE = OnceAMinute()
 _log = logging.getLogger(__name__)
 
@@ -72,9 +76,16 @@ class _Server(uvicorn.Server):
     after its shutdown, and take a second SIGINT as permission to abort."""
 
     def __init__(
-        self, config: uvicorn.Config, jobs: Jobs, listening: Listening, live: Live, alarms: AlarmWatch
+        self,
+        config: uvicorn.Config,
+        jobs: Jobs,
+        listening: Listening,
+        live: Live,
+        alarms: AlarmWatch,
+        streams_over: threading.Event,
     ) -> None:
         super().__init__(config)
+        self._streams_over = streams_over
         self._jobs = jobs
         self._listening = listening
         self._live = live
@@ -86,6 +97,7 @@ class _Server(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self._live.close()  # nothing else ends these streams, and the server waits for its connections
+        asyncio.get_running_loop().call_later(STREAMS_GRACE_S, self._streams_over.set)
         await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -258,10 +270,13 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         own = OwnGateway(jobs, listening, setup.url, alarms)
         announcing = stack.enter_context(closing(Announcing(jobs, own)))
         live_stream = Live(jobs, listening, alarms, others)
+        streams_over = threading.Event()
         app = create_app(
-            jobs, policy, checks, pool, station.sdo_retries, listening, live_stream, figures, alarms, own, others
-        )
-        server = _Server(server_config(app, setup, listener, descriptors), jobs, listening, live_stream, alarms)
+            jobs, policy, checks, pool, station.sdo_retries, listening, live_stream, figures, alarms, own, others,
+            streams_over.is_set,
+        )  # fmt: skip
+        config = server_config(app, setup, listener, descriptors)
+        server = _Server(config, jobs, listening, live_stream, alarms, streams_over)
 
         def end() -> None:
             """Ends jobs and server: the server waits for its connections, and event streams end with their jobs."""

@@ -5,7 +5,7 @@
 A stage lasts until FOLDER/go-STAGE (or FOLDER/go) is there; the controllers outlive the process as FOLDER/TAG.json.
 With --hours-back its clock is set back as soon as FOLDER/clock-is-back is there. The loops of --on-bus are on a bus in
 memory, on which no node answers.
-Nothing is restored while FOLDER/TAG.held is there.
+Nothing is restored while FOLDER/TAG.held is there. --streams-grace-s: after how long a stop ends the streams of jobs.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from loopwright.service.execution.procedures import Hooks, Outcome
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import RetuneRequest
 from loopwright.service.loops.loop import Loop, Restored
+from loopwright.service.server import serving
 from loopwright.service.server.serving import Setup, open_bus_loop, serve
 from loopwright.service.states.loop_state import LoopState, differences, loop_state, state_json
 from loopwright.service.store import store
@@ -180,7 +181,9 @@ def main() -> None:
     parser.add_argument("--trusted-proxy", action="append", type=ip_network, default=[])
     parser.add_argument("--on-bus", action="append", default=[])
     parser.add_argument("--sigkill")
+    parser.add_argument("--streams-grace-s", type=float, default=serving.STREAMS_GRACE_S)
     asked = parser.parse_args()
+    serving.STREAMS_GRACE_S = asked.streams_grace_s
     if asked.sigterm:
         ended_by(signal.SIGTERM, *asked.sigterm.split())
     if asked.sigkill:

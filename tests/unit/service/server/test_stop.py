@@ -130,6 +130,28 @@ def test_further_signals_do_not_cut_the_stop_short(under_test: tuple[Gateway, st
     assert job_in(tmp_path, url) == ("aborted", "service_stopped")
 
 
+def test_a_stream_ends_before_a_stop_that_takes_long(stack: ExitStack, tmp_path: Path) -> None:
+    """A job's stream ends with the job; where its loop takes longer to come home than the server waits for its
+    connections, the stream ends before, as a stream that is to be resumed."""
+    gateway = Gateway(stack, tmp_path, more=["--streams-grace-s=1"])
+    url = gateway.retune()
+    gateway.in_stage(url, "ultimate")
+    held = tmp_path / f"{TAG}.held"
+    held.touch()
+    with gateway.http.stream("GET", f"{url}/events") as stream:
+        lines = stream.iter_lines()
+        assert next(line for line in lines if line.startswith("event: progress"))
+        gateway.process.signal(signal.SIGTERM)
+        said = list(lines)
+    assert gateway.process.poll() is None and read_loop(tmp_path, TAG).gains == NEW
+    assert said[-2:] == [": the service ends, and the job has not ended yet", ""]
+    held.unlink()
+    assert ended(gateway) == 0, log_of(gateway)
+    assert "Traceback" not in log_of(gateway) and " ERROR " not in log_of(gateway), log_of(gateway)
+    assert read_loop(tmp_path, TAG) == HOME
+    assert job_in(tmp_path, url) == ("aborted", "service_stopped")
+
+
 def test_a_signal_after_everything_has_ended_ends_a_process_that_hangs(tmp_path: Path) -> None:
     hangs = (
         "import os, signal, threading\n"
