@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+import threading
+from datetime import UTC, datetime, timedelta
 
 from sqlalchemy import func, select
 
 from loopwright.service.store import audit
 from loopwright.service.store.clock import stamp
-from loopwright.service.store.clock_watch import Jump, Seen
+from loopwright.service.store.clock_watch import ClockWatch, Jump, Seen
 from loopwright.service.store.store import Store, of_host
 from loopwright.service.store.tables import HostRow, JobRow
 
@@ -33,6 +34,28 @@ def keep_seen(store: Store, seen: Seen, jump: Jump | None) -> None:
         if jump is not None:
             before, after = {"expected": stamp(jump.expected)}, {"clock": stamp(jump.to), "text": jump.text}
             audit.record(session, "clock_jump", "retention", before=before, after=after)
+
+
+class Ages:
+    """What may be taken for old: nothing counts as older than the last jump of the clock. The clock is looked at as
+    this is asked, because what is written down of it is up to a minute old.
+
+    longest: how long the service may have been stopped and its clock still be believed.
+    Made before the retention writes down what the clock says now. Raises SQLAlchemyError.
+    """
+
+    def __init__(self, store: Store, longest: timedelta, clock: ClockWatch | None = None) -> None:
+        self._clock, self._longest = clock or ClockWatch(), longest
+        self._lock = threading.Lock()
+        self._clock.look(last_seen(store), longest)
+
+    def before(self, at: datetime, age: timedelta) -> datetime | None:
+        """What is from before this time is older than that at the present `at`; None: nothing is known to be."""
+        with self._lock:
+            self._clock.look(None, self._longest)
+            seen = self._clock.seen
+        from_ = None if seen is None else seen.ages_from
+        return None if from_ is not None and from_ > at - age else at - age
 
 
 def _time(text: str) -> datetime:

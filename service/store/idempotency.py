@@ -18,11 +18,15 @@ from sqlalchemy.orm import Session
 
 from loopwright.service.store.claims import Claim, StillAnswering
 from loopwright.service.store.clock import stamp
+from loopwright.service.store.clock_watch import STEP
+from loopwright.service.store.hosts import Ages
 from loopwright.service.store.lock import HostLock
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import IdempotencyRow
 
 KEPT_H = 24
+"""Hours for which a key is kept at least. After a stop of more than STEP the clock may have jumped by as much: all keys
+are then kept for so long from the start on."""
 MAX_KEYS = 5000
 """Of one principal: the oldest answers beyond that are forgotten."""
 MAX_BYTES = 16_384
@@ -43,11 +47,12 @@ class Answer:
 
 
 class IdempotencyKeys:
-    """The keys in the database, as one process sees them. most: keys of one principal."""
+    """The keys in the database, as one process sees them. maximum: of one principal. Raises SQLAlchemyError."""
 
-    def __init__(self, store: Store, maximum: int = MAX_KEYS) -> None:
+    def __init__(self, store: Store, maximum: int = MAX_KEYS, ages: Ages | None = None) -> None:
         self._store = store
         self._max = maximum
+        self._ages = ages or Ages(store, STEP)
         # Tokens of the requests that this process is answering.
         self._answering: set[str] = set()
 
@@ -90,10 +95,13 @@ class IdempotencyKeys:
     def _forget(self, session: Session, principal: str, at: datetime) -> None:
         """What is too old, what was cut off on this host without an effect, and the oldest answers of too many."""
         keys = IdempotencyRow
-        session.execute(delete(keys).where(keys.at < stamp(at - timedelta(hours=KEPT_H))))
+        not_answering = keys.token.not_in(list(self._answering))
+        old = self._ages.before(at, timedelta(hours=KEPT_H))
+        if old is not None:
+            session.execute(delete(keys).where(keys.at < stamp(old), not_answering))
         here = keys.host == self._store.host if self._store.shared else true()
         unanswered = keys.status.is_(None) & keys.effect.is_(None)
-        session.execute(delete(keys).where(here, unanswered, keys.token.not_in(list(self._answering))))
+        session.execute(delete(keys).where(here, unanswered, not_answering))
         newest = select(keys.at).where(keys.principal == principal).order_by(keys.at.desc())
         last = session.scalar(newest.offset(self._max - 1).limit(1))
         if last is not None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from sqlalchemy import delete, func, select, update
+from sqlalchemy import and_, delete, func, or_, select, update
 from sqlalchemy.orm import Session
 
 from loopwright.service.store.clock import now
@@ -45,14 +46,17 @@ def add(session: Session, host: str, hook: str, job_id: str, body: str, due_s: f
     )  # fmt: skip
 
 
-def next_due(store: Store, hook: str, now_s: float) -> Delivery | None:
-    """Returns what is to be delivered to a webhook next; None: nothing is due. Raises SQLAlchemyError."""
-    wanted = (
-        select(Row)
-        .where(Row.host == store.host, Row.state == DeliveryState.WAITING.value, Row.hook == hook, Row.due_s <= now_s)
-        .order_by(Row.due_s, Row.number)
-        .limit(1)
-    )
+def next_due(store: Store, hook: str, now_s: float, delays_s: Sequence[float]) -> Delivery | None:
+    """Returns what is to be delivered to a webhook next; None: nothing is due. Raises SQLAlchemyError.
+
+    delays_s: from a failed attempt to the next one, s. What is due later than that waits for a clock that was set back
+    since, and is due now.
+    """
+    waits = (Row.host == store.host, Row.state == DeliveryState.WAITING.value, Row.hook == hook)
+    longest_s = enumerate((0.0, *delays_s))
+    set_back = (and_(Row.attempts == attempts, Row.due_s > now_s + delay_s) for attempts, delay_s in longest_s)
+    due = or_(Row.due_s <= now_s, *set_back)
+    wanted = select(Row).where(*waits, due).order_by(Row.due_s, Row.number).limit(1)
     with store.reading() as session:
         row = session.scalars(wanted).one_or_none()
         return None if row is None else _delivery(row)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping
+from datetime import UTC, datetime, timedelta
 from functools import partial
 
 from loopwright.service.inputs.webhooks import WebhookConfig
@@ -12,24 +14,28 @@ from loopwright.service.live.webhooks.connection import NotDelivered, post
 from loopwright.service.live.webhooks.messages import headers
 from loopwright.service.live.webhooks.times import DeliveryTimes
 from loopwright.service.store import webhook_deliveries
+from loopwright.service.store.clock_watch import ClockWatch, longest_stop
+from loopwright.service.store.hosts import Ages
 from loopwright.service.store.store import Store
 from loopwright.service.store.webhook_deliveries import Delivery, DeliveryState
 from loopwright.service.telemetry.metrics import WEBHOOK_ATTEMPTS, WEBHOOKS_WAITING
 
 log = logging.getLogger(__name__)
 
-KEPT_S = 30 * 86_400.0
-"""Wall time for which what is over is kept, s."""
+KEPT_DAYS = 30.0
+"""Wall time for which what is over is kept at least."""
+_FORGETS_S = 3600.0
 _GONE = 410
 """The status by which a receiver says that it wants nothing of the kind any more."""
 
 
 class Sender:
-    """Delivers the messages of one webhook, in a thread of its own."""
+    """Delivers the messages of one webhook, in a thread of its own. Raises SQLAlchemyError."""
 
     def __init__(self, config: WebhookConfig, secret: bytes, store: Store, clock: DeliveryTimes) -> None:
         self._config, self._secret, self._store, self._clock = config, secret, store, clock
-        self._forgotten_s = 0.0
+        self._forgotten_s = -math.inf
+        self._ages = Ages(store, longest_stop(KEPT_DAYS), ClockWatch(self._now, clock.passed_s))
         name = f"webhook {config.name}"
         self._repeated = Repeated(self.turn, clock.look_s, name, f"{name} cannot deliver")
         self._waiting = WEBHOOKS_WAITING.labels(config.name)
@@ -50,16 +56,23 @@ class Sender:
     def turn(self) -> None:
         """Delivers what is due. Raises SQLAlchemyError, FolderInUse."""
         while not self._repeated.closed:
-            due = webhook_deliveries.next_due(self._store, self._config.name, self._clock.now_s())
+            now_s, delays_s = self._clock.now_s(), self._clock.delays_s
+            due = webhook_deliveries.next_due(self._store, self._config.name, now_s, delays_s)
             if due is None:
                 break
             self._deliver(due)
         if self._repeated.closed:
             return
         self._waiting.set(webhook_deliveries.waiting(self._store, self._config.name))
-        if self._clock.now_s() - self._forgotten_s > 3600.0:
-            webhook_deliveries.delete_over(self._store, self._clock.now_s() - KEPT_S)
-            self._forgotten_s = self._clock.now_s()
+        passed_s = self._clock.passed_s()
+        if passed_s - self._forgotten_s > _FORGETS_S:
+            old = self._ages.before(self._now(), timedelta(days=KEPT_DAYS))
+            if old is not None:
+                webhook_deliveries.delete_over(self._store, old.timestamp())
+            self._forgotten_s = passed_s
+
+    def _now(self) -> datetime:
+        return datetime.fromtimestamp(self._clock.now_s(), UTC)
 
     def _deliver(self, message: Delivery) -> None:
         config = self._config

@@ -36,7 +36,7 @@ class Webhooks:
 
     folder: that of loops.yaml, from which the files with the secrets are named.
     own_url: where browsers reach this service, if known.
-    Raises BadSecret.
+    Raises BadSecret, SQLAlchemyError.
     """
 
     def __init__(

@@ -22,6 +22,8 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.security.keys import Scope
 from loopwright.service.store import audit, claims
 from loopwright.service.store.claims import Claim, StillAnswering
+from loopwright.service.store.clock_watch import STEP, ClockWatch, Seen
+from loopwright.service.store.hosts import Ages, keep_seen
 from loopwright.service.store.idempotency import MAX_BYTES, Answer, IdempotencyKeys, OtherRequest
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
@@ -418,6 +420,36 @@ def test_kept_for_a_day(keys: IdempotencyKeys) -> None:
     with pytest.raises(OtherRequest):
         keys.claim("me", "a", "g", AT + timedelta(hours=23, minutes=59))
     claim(keys, "a", "g", AT + timedelta(hours=24, minutes=1))
+
+
+def test_a_clock_that_jumps_ahead_forgets_no_key(store: Store) -> None:
+    wall, passed_s = AT, 0.0
+    keys = IdempotencyKeys(store, ages=Ages(store, STEP, ClockWatch(lambda: wall, lambda: passed_s)))
+    keys.keep(claim(keys, "a"), YES)
+    wall += timedelta(days=2)
+    assert keys.claim("me", "a", "f", wall) == YES
+    wall, passed_s = wall + timedelta(hours=23), 23 * 3600.0
+    assert keys.claim("me", "a", "f", wall) == YES
+    wall, passed_s = wall + timedelta(hours=2), 25 * 3600.0  # a day that the service itself has seen
+    claim(keys, "a", "g", wall)
+
+
+@pytest.mark.parametrize("days", [0.8, 2.0, 400.0])
+def test_a_clock_that_jumped_while_the_service_was_stopped_forgets_no_key(days: float, store: Store) -> None:
+    before = AT - timedelta(hours=12)
+    keys = IdempotencyKeys(store)
+    keys.keep(claim(keys, "a", at=before), YES)
+    keep_seen(store, Seen(AT), None)
+    wall = AT + timedelta(days=days)
+    again = IdempotencyKeys(store, ages=Ages(store, STEP, ClockWatch(lambda: wall, lambda: 0.0)))
+    assert again.claim("me", "a", "f", wall) == YES
+
+
+def test_what_is_being_answered_is_not_forgotten_for_its_age(keys: IdempotencyKeys) -> None:
+    first = claim(keys, "a")
+    with pytest.raises(StillAnswering):
+        keys.claim("me", "a", "f", AT + timedelta(hours=25))
+    keys.keep(first, YES)
 
 
 def test_the_oldest_of_too_many_are_forgotten_of_each_principal_apart(keys: IdempotencyKeys) -> None:

@@ -25,6 +25,7 @@ from loopwright.service.inputs.request import retune_request
 from loopwright.service.inputs.webhooks import BadSecret, WebhookConfig, read_secret
 from loopwright.service.live.webhooks import connection
 from loopwright.service.live.webhooks.connection import NotDelivered, post
+from loopwright.service.live.webhooks.sender import Sender
 from loopwright.service.live.webhooks.times import DeliveryTimes
 from loopwright.service.live.webhooks.webhooks import Webhooks
 from loopwright.service.states.job_state import JobState
@@ -309,6 +310,52 @@ def test_old_messages_are_deleted(service: Service, tmp_path: Path, receiver: Ca
     assert states(service.store)
     webhook_deliveries.delete_over(service.store, time.time() + 60.0)
     assert not states(service.store)
+
+
+class Passing:
+    """A wall clock that somebody sets, the time that passes, and a webhook's sender that goes by both."""
+
+    def __init__(self, service: Service, folder: Path, url: str) -> None:
+        self.now_s, self.passed_s = time.time(), 1000.0
+        (folder / "secret").write_text(base64.b64encode(SECRET).decode())
+        times = DeliveryTimes(lambda: self.now_s, lambda: self.passed_s)
+        self.storing = Webhooks([config(url)], folder, service.store, None, times)
+        self.sender = Sender(config(url), SECRET, service.store, times)
+
+    def go_on(self, days: float) -> None:
+        self.now_s, self.passed_s = self.now_s + 86_400.0 * days, self.passed_s + 86_400.0 * days
+        self.sender.turn()
+
+
+def test_a_clock_that_jumps_ahead_deletes_no_message(
+    service: Service, tmp_path: Path, receiver: Callable[..., Receiver]
+) -> None:
+    clock = Passing(service, tmp_path, receiver(204).url)
+    ended(service)
+    clock.sender.turn()
+    clock.now_s += 31 * 86_400.0
+    for days in (0.1, 1.0, 28.0):
+        clock.go_on(days)
+        assert states(service.store) == [("plant-it", "delivered", 1)]
+    clock.go_on(1.1)  # thirty days that the service itself has seen
+    assert not states(service.store)
+
+
+@pytest.mark.parametrize("back_s", [60.0, 3600.0, 86_400.0])
+def test_a_message_does_not_wait_for_a_clock_that_is_set_back(
+    back_s: float, service: Service, tmp_path: Path, receiver: Callable[..., Receiver]
+) -> None:
+    hook = receiver(500, 204)
+    clock = Passing(service, tmp_path, hook.url)
+    ended(service)
+    clock.now_s -= back_s
+    clock.sender.turn()
+    assert states(service.store) == [("plant-it", "waiting", 1)] and len(hook.received) == 1
+    clock.sender.turn()
+    assert len(hook.received) == 1, "it is tried again after 5 s"
+    clock.now_s -= back_s
+    clock.sender.turn()
+    assert states(service.store) == [("plant-it", "delivered", 2)]
 
 
 @pytest.mark.parametrize(("address", "public"), [
