@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import partial
 
 import numpy as np
@@ -46,6 +46,8 @@ from loopwright.service.states.job_state import IllegalMove, JobState
 from loopwright.service.states.loop_state import LoopState, loop_state, same_gains
 from loopwright.service.store import watches
 from loopwright.service.store.clock import now, stamp
+from loopwright.service.store.clock_watch import ClockWatch, longest_stop, uptime_s
+from loopwright.service.store.hosts import Ages
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.live_jobs import latest_jobs
 from loopwright.service.store.store import Busy, Store
@@ -60,8 +62,8 @@ BY = "watch after acceptance"
 """Who puts gains back, as the audit log has it."""
 OUTSIDE_S = 3.0
 """Wall time for which PV must be outside its limits, s."""
-LONGEST_S = 30.0 * 86_400.0
-"""Wall time after which a watch ends that has not seen enough changes, s."""
+LONGEST_DAYS = 30.0
+"""Wall time after which a watch ends that has not seen enough changes."""
 _ROUND_S = 1.0
 _LEAST_S = 2.0
 """Least wall time between two looks at the history of a loop, s; a quarter of the ultimate period where that is
@@ -72,14 +74,16 @@ _EACH_S = 0.1
 
 @dataclass
 class _LoopSeen:
-    """A watched loop as this process knows it. Times are wall time, s.
+    """A watched loop as this process knows it. Times are those of a clock that nobody sets, s.
 
-    due_s: when its history is looked at again. inside: whether PV was within its limits since the acceptance.
+    began_s: when this process saw the watch first. due_s: when the history of the loop is looked at again.
+    inside: whether PV was within its limits since the acceptance.
     outside_from_s: since when PV is outside of them; None: it is not.
     mode, sp: the last that were heard. After a lost frame they are unknown until they are read, and where many are lost
     nearly always; the controller is read in any case before gains are put back.
     """
 
+    began_s: float
     due_s: float = 0.0
     mode: int = UNKNOWN_MODE
     sp: float = math.nan
@@ -91,6 +95,8 @@ class Watching:
     """Watches the loops of this host whose gains were accepted, in a thread.
 
     wall: the wall clock, s since 1970 UTC, and so the clock of the history.
+    passed_s: the time that has passed, s, which nobody sets: what the watch itself waits for goes by this.
+    Raises SQLAlchemyError.
     """
 
     def __init__(
@@ -101,9 +107,11 @@ class Watching:
         listening: Listening,
         pool: Pool,
         wall: Callable[[], float] = time.time,
+        passed_s: Callable[[], float] = uptime_s,
     ) -> None:
         self._store, self._directory, self._decisions = store, directory, decisions
-        self._listening, self._pool, self._wall = listening, pool, wall
+        self._listening, self._pool, self._wall, self._passed_s = listening, pool, wall, passed_s
+        self._ages = Ages(store, longest_stop(LONGEST_DAYS), ClockWatch(lambda: _utc(wall()), passed_s))
         self._loops: dict[str, _LoopSeen] = {}
         failed = "the loops with accepted gains could not be watched"
         self._looks = Repeated(self.look, _ROUND_S, "watches accepted gains", failed)
@@ -131,14 +139,18 @@ class Watching:
                     self._look(job_id, config, watch)
 
     def _look(self, job_id: str, config: LoopConfig, watch: AcceptanceWatch) -> None:
-        job, now_s = self._store.get(job_id), self._wall()
+        job, now_s, passed_s = self._store.get(job_id), self._wall(), self._passed_s()
         if watch.trouble is not None and watch.trouble.put_back is None:  # this thread settles it before it looks again
             self._not_put_back(job_id, "the service ended, or could not write it down, meanwhile: read the loop")
-        why = self._over(job, watch, now_s)
+        known = self._loops.setdefault(job_id, _LoopSeen(began_s=passed_s, inside=watch.inside))
+        why = self._over(job, watch, known, now_s)
         if why is not None:
             self._end(job_id, why)
             return
-        known = self._loops.setdefault(job_id, _LoopSeen(inside=watch.inside))
+        if now_s < max(watch.since_s, watch.looked_to_s):
+            log.warning("the wall clock was set back: operation under the gains of job %s counts from now on", job_id)
+            watch = watches.change(self._store, job_id, partial(watches.set_back, now_s=now_s)) or watch
+            known.due_s = max(known.due_s, passed_s + _LEAST_S)  # the listener drops what it has heard before meanwhile
         heard = self._listening.heard.get(config.tag)
         not_heard = self._listening.why_not_heard(config.tag)
         if not_heard is None and (heard is None or heard.silent):
@@ -148,28 +160,31 @@ class Watching:
         if not_heard is not None or heard is None:
             known.outside_from_s = None
             return
-        text = self._outside(known, config, heard, now_s)
+        if known.mode == Mode.AUTOMATIC and heard.mode not in (UNKNOWN_MODE, Mode.AUTOMATIC):
+            watch = self._disarmed(job_id, watch, heard.at_s)  # also where the history of it is lost
+        text = self._outside(known, config, heard, passed_s)
         if known.inside and not watch.inside:  # a service that is started again need not see that for itself
             watch = watches.change(self._store, job_id, partial(_with, inside=True)) or watch
         if text is not None:
             self._trouble(job, watch, TroubleKind.PV_OUTSIDE_LIMITS, text)
-        elif now_s >= known.due_s:
+        elif passed_s >= known.due_s:
             self._look_back(job, config, watch, known, now_s)
 
-    def _over(self, job: Job, watch: AcceptanceWatch, now_s: float) -> WatchEnd | None:
+    def _over(self, job: Job, watch: AcceptanceWatch, known: _LoopSeen, now_s: float) -> WatchEnd | None:
         """Why a watch is over; None: it goes on."""
         if job.state is not JobState.ACCEPTED:
             return WatchEnd.ROLLED_BACK
         latest = latest_jobs(self._store, job.loop).get(job.loop)
-        if latest is not None and latest.id != job.id and latest.at > watch.since:
+        if latest is not None and latest.id not in (job.id, watch.latest_job):
             return WatchEnd.RETUNED
-        read = self._listening.gains_read(job.loop)
-        if read is not None and read[1] > watch.since_s and not same_gains(read[0], new_gains(job)):
+        read = self._listening.gains_read_since(job.loop, known.began_s)
+        if read is not None and not same_gains(read, new_gains(job)):
             return WatchEnd.GAINS_CHANGED
-        return WatchEnd.TOO_LONG if now_s - watch.since_s > LONGEST_S else None
+        old = self._ages.before(_utc(now_s), timedelta(days=LONGEST_DAYS))
+        return WatchEnd.TOO_LONG if old is not None and watch.since_s < old.timestamp() else None
 
     @staticmethod
-    def _outside(known: _LoopSeen, config: LoopConfig, heard: Heard, now_s: float) -> str | None:
+    def _outside(known: _LoopSeen, config: LoopConfig, heard: Heard, passed_s: float) -> str | None:
         """In words that PV has left its limits; None: it has not, or the set-point has."""
         limits = config.pv_limits
         if heard.mode != UNKNOWN_MODE:
@@ -183,24 +198,24 @@ class Watching:
             return None
         if not known.inside:
             return None
-        known.outside_from_s = now_s if known.outside_from_s is None else min(known.outside_from_s, now_s)
-        if now_s - known.outside_from_s < OUTSIDE_S:
+        if known.outside_from_s is None:
+            known.outside_from_s = passed_s
+        if passed_s - known.outside_from_s < OUTSIDE_S:
             return None
         side, limit = ("below", limits.low) if low else ("above", limits.high)
         return f"PV went {side} its limit of {limit:g} {config.pv_unit} under the new gains"
 
     def _look_back(self, job: Job, config: LoopConfig, watch: AcceptanceWatch, known: _LoopSeen, now_s: float) -> None:
         """Looks at the history since the acceptance. Raises SQLAlchemyError, FolderInUse."""
-        asked = self._question(job, config)
+        asked = self._question(job, config, watch)
         bins = asked.rows.bins
         sample_time_s = asked.state.sample_time_s
         speed = (wall_period_s(bins) or sample_time_s) / sample_time_s  # a simulated plant may run faster
         least_s = max(_LEAST_S, _EACH_S * len(self._loops))
-        known.due_s = now_s + max(least_s, 0.25 * watch.period_s * speed)
-        left = _left_automatic(asked, watch.since_s)
-        if left is not None and watch.disarmed is None and watch.roll_back_by_itself:
-            text = f"the mode was changed at {stamp(datetime.fromtimestamp(left, UTC))}"
-            watch = watches.change(self._store, job.id, partial(_with, disarmed=text)) or watch
+        known.due_s = self._passed_s() + max(least_s, 0.25 * watch.period_s * speed)
+        left_s = _left_automatic(asked, watch.since_s)
+        if left_s is not None:
+            watch = self._disarmed(job.id, watch, left_s)
         found = oscillation(asked, new_gains(job), watch.period_s, watch.since_s)
         if found is not None and watch.trouble is None:
             text = (
@@ -214,10 +229,18 @@ class Watching:
         if _complete(watch, (now_s - watch.since_s) / speed):
             self._end(job.id, WatchEnd.COMPLETE)
 
-    def _question(self, job: Job, config: LoopConfig) -> Question:
+    def _disarmed(self, job_id: str, watch: AcceptanceWatch, left_s: float) -> AcceptanceWatch:
+        """The watch of a loop that has left automatic at this wall time, s. Raises SQLAlchemyError, FolderInUse."""
+        if watch.disarmed is not None or not watch.roll_back_by_itself:
+            return watch
+        text = f"the mode was changed at {stamp(_utc(left_s))}"
+        return watches.change(self._store, job_id, partial(_with, disarmed=text)) or watch
+
+    def _question(self, job: Job, config: LoopConfig, watch: AcceptanceWatch) -> Question:
         state = _state(job)
         disturbers = self._directory.disturbers(config.tag)
-        return question(self._listening, self._store, config, state, DesignSpec(), disturbers, self._wall)
+        heard_by, spec = self._listening, DesignSpec()
+        return question(heard_by, self._store, config, state, spec, disturbers, self._wall, watch.since_s)
 
     # what is compared
 
@@ -239,7 +262,7 @@ class Watching:
             except Ended as ended:
                 log.warning("a change could not be compared with the model of job %s: %s", job_id, ended.detail)
                 continue
-            if found.changes:
+            if found.changes and found.looked_to_s <= self._wall():  # else they are of a clock that was set back since
                 changes = (*watch.changes, *found.changes)
                 make = partial(_with, changes=changes, looked_to_s=found.looked_to_s)
                 later = watches.change(self._store, job_id, make)
@@ -274,6 +297,10 @@ class Watching:
     def _end(self, job_id: str, why: WatchEnd) -> None:
         log.info("the watch of job %s has ended: %s", job_id, why)
         watches.change(self._store, job_id, lambda watch: watches.ended(watch, why))
+
+
+def _utc(at_s: float) -> datetime:
+    return datetime.fromtimestamp(at_s, UTC)
 
 
 def _with(watch: AcceptanceWatch, **fields: object) -> AcceptanceWatch:

@@ -31,6 +31,7 @@ from loopwright.service.listening.heard_node import HeardHeartbeat
 from loopwright.service.listening.messages import HistoryAnswer, Learn, NewSamples, Report
 from loopwright.service.listening.process import ListeningProcess, NotListening
 from loopwright.service.store import history
+from loopwright.service.store.clock_watch import uptime_s
 from loopwright.service.store.history import HistoryBlock
 from loopwright.service.store.store import Store
 from loopwright.service.telemetry.metrics import FRAMES_HEARD, LISTENING_UP
@@ -94,8 +95,8 @@ class Listening:
         """What was heard last, by tag: replaced as a whole once a second."""
         self.nodes: Mapping[tuple[str, int], HeardHeartbeat] = {}
         """The heartbeats heard last, by bus and node: replaced as a whole once a second."""
-        self._gains: dict[str, tuple[GainSet, float]] = {}
-        """The gains of each loop as they were read last, and when that reading began, s."""
+        self._gains: dict[str, tuple[GainSet, float, float]] = {}
+        """The gains of each loop as they were read last, and when that reading began: wall time, and uptime_s."""
         self.on_report: Callable[[], None] = lambda: None
         """Called in another thread when `heard` or a bus may have changed."""
         self.on_samples: Callable[[NewSamples], None] = lambda _: None
@@ -162,6 +163,12 @@ class Listening:
         they are not known."""
         found = self._gains.get(tag)
         return None if found is None else (Gains(*found[0]), found[1])
+
+    def gains_read_since(self, tag: str, since_s: float) -> Gains | None:
+        """Returns the gains of a loop as they were read last, where that reading began after this time of uptime_s,
+        which nobody sets; None where they are not known."""
+        found = self._gains.get(tag)
+        return None if found is None or found[2] <= since_s else Gains(*found[0])
 
     def buses(self) -> dict[str, str | None]:
         """Returns the buses of this host, each with why it is not heard at present; None: it is heard."""
@@ -240,7 +247,7 @@ class Listening:
             for tag in self._to_read:
                 if time.monotonic() - last.get(tag, -math.inf) < PER_LOOP_S:
                     continue
-                last[tag] = time.monotonic()
+                last[tag], began_s = time.monotonic(), uptime_s()
                 try:
                     found = self._read(tag) if self._read is not None else None
                 except Ended:
@@ -252,7 +259,7 @@ class Listening:
                     if found.gains is None:
                         self._gains.pop(tag, None)
                     else:
-                        self._gains[tag] = found.gains, found.began_s
+                        self._gains[tag] = found.gains, found.began_s, began_s
                     self.process.learn(Learn(tag, found))
                 if self._over.wait(EACH_S):
                     return

@@ -3,6 +3,7 @@ of its neighbours."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Collection, Sequence
 from datetime import UTC, datetime
@@ -29,10 +30,13 @@ def question(
     spec: DesignSpec,
     disturbers: Collection[str] = (),
     clock: Callable[[], float] = time.time,
+    accepted_s: float = math.inf,
 ) -> Question:
     """Everything that the evaluation needs. Raises SQLAlchemyError.
 
     disturbers: the loops whose tests disturb this one, see `neighbours`.
+    accepted_s: wall time of an acceptance, before which every test of the loop has ended: what says to be of a later
+    time is of a clock that was set back since, and does not count.
     """
     now_s = clock()
 
@@ -44,11 +48,11 @@ def question(
     if wanted is not None:
         together, found = wanted.together, history(wanted.from_s)
     from_s = float(found.rows.bins["at_s"][0]) if len(found.rows.bins) else now_s
-    own = _tests(store, (config.tag,), from_s)
+    own = [each for each in _tests(store, (config.tag,), from_s) if each.to_s is None or each.to_s <= accepted_s]
     theirs = [each for each in _tests(store, disturbers, from_s) if each.session]
     times = [each.within(from_s, now_s) for each in (*own, *theirs)]
     until_s = outdated_until_s(store, config.tag)
-    if until_s is not None:  # what was heard before is of another plant
+    if until_s is not None and until_s <= accepted_s:  # what was heard before is of another plant
         times.append((from_s, until_s))
     return Question(
         config,

@@ -64,7 +64,8 @@ class Trouble(_Kept):
 class AcceptanceWatch(_Kept):
     """The watch of one acceptance.
 
-    since: when the gains were accepted: UTC, ISO 8601. by: who has accepted them.
+    since: when the gains were accepted, or a clock was set back behind that: UTC, ISO 8601. by: who has accepted them.
+    latest_job: the latest job of the loop as they were accepted.
     roll_back_by_itself: whether the old gains are to be put back where something goes wrong.
     inside: whether PV was within its limits since then: one that never was does not leave them.
     disarmed: why they are not put back any more, in words; None: they are, if that was asked for.
@@ -78,6 +79,7 @@ class AcceptanceWatch(_Kept):
 
     since: str
     by: str
+    latest_job: str | None = None
     roll_back_by_itself: bool
     period_s: float
     model: str | None = None
@@ -92,7 +94,7 @@ class AcceptanceWatch(_Kept):
 
     @property
     def since_s(self) -> float:
-        """When the gains were accepted, wall time, s."""
+        """Since when what is heard counts, wall time, s."""
         return datetime.fromisoformat(self.since).timestamp()
 
     @property

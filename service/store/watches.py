@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from loopwright.service.states.acceptance_watch import AcceptanceWatch, WatchEnd
-from loopwright.service.store.clock import now
+from loopwright.service.store.clock import now, stamp
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow, LoopRow, WatchRow
 
@@ -35,6 +36,8 @@ def begin(session: Session, job: JobRow, watch: AcceptanceWatch) -> None:
         if row.open:
             _set(row, ended(row.watch, WatchEnd.RETUNED))
         row.abnormal = False  # what was said of it is of gains that are no longer in effect
+    of_loop = select(JobRow.id).where(JobRow.loop == job.loop, JobRow.dry_run.is_(False))
+    watch = watch.model_copy(update={"latest_job": session.scalar(of_loop.order_by(JobRow.number.desc()).limit(1))})
     session.merge(WatchRow(job_id=job.id, loop=job.loop, open=True, abnormal=False, watch=watch))
 
 
@@ -50,6 +53,13 @@ def rolled_back(session: Session, job: JobRow) -> None:
 def ended(watch: AcceptanceWatch, why: WatchEnd) -> AcceptanceWatch:
     """The watch, ended now."""
     return watch.model_copy(update={"end": why, "ended_at": now()})
+
+
+def set_back(watch: AcceptanceWatch, now_s: float) -> AcceptanceWatch:
+    """The watch after the clock was set back, perhaps behind its beginning: what is heard from now on counts. now_s:
+    wall time, s."""
+    since = stamp(datetime.fromtimestamp(min(watch.since_s, now_s), UTC))
+    return watch.model_copy(update={"since": since, "looked_to_s": min(watch.looked_to_s, now_s)})
 
 
 def open_here(store: Store) -> dict[str, tuple[str, AcceptanceWatch]]:

@@ -69,8 +69,8 @@ class SimListening:
     def why_not_heard(self, tag: str) -> str | None:
         return None if self._world.wire.state is State.UP else "the bus is down"
 
-    def gains_read(self, tag: str) -> tuple[Gains, float] | None:
-        return self._read
+    def gains_read_since(self, tag: str, since_s: float) -> Gains | None:
+        return self._read[0] if self._read is not None and self._read[1] > since_s else None
 
     def history(self, tag: str, from_s: float, to_s: float, points: int) -> History:
         return History(self._loop.rings.rows(from_s, to_s, points), self.why_not_heard(tag))
@@ -84,7 +84,8 @@ def watched(world: World, gateway: Gateway, upset: Callable[[], None], until_s: 
 
     def boot(jobs: Jobs, process: Process) -> None:
         looks = Watching(
-            gateway.store, jobs.directory, jobs.decisions, SimListening(world, process), None, lambda: world.wall_s
+            gateway.store, jobs.directory, jobs.decisions, SimListening(world, process), None,
+            lambda: world.wall_s, lambda: world.wall_s,
         )  # type: ignore[arg-type]  # fmt: skip
 
         def look() -> None:

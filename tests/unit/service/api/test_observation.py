@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from loopwright.service.api.app import create_app
 from loopwright.service.cli import loops
 from loopwright.service.cli import main as cli
+from loopwright.service.inputs.request import FastRetune
 from loopwright.service.listening.rings import Rings
 from loopwright.service.observing.hearing import question
 from loopwright.service.results import FindingSource, GainsView
@@ -145,6 +146,16 @@ def test_changes_during_a_test_are_no_operation(service: Service) -> None:
         start(client)
         assert question(HeardBefore(rings), *at).heard() == [], "the test that began at the begin goes on"
         service.tune.hold.set()
+
+
+def test_a_test_that_a_clock_set_back_makes_later_than_its_acceptance_does_not_count(service: Service) -> None:
+    begun_s = time.time()
+    service.wait(service.jobs.start(TAG, FastRetune()).id)
+    rings, state = LOOP.heard(MOVES, 3800, begun_s + 200.0), replace(service.controller.state, sample_time_s=LOOP.Ts)
+    at = service.store, service.loops[TAG], state, DesignSpec(), (), lambda: begun_s + 200.0
+    assert len(question(HeardBefore(rings), *at).heard()) == 2
+    assert len(question(HeardBefore(rings), *at, time.time()).heard()) == 2
+    assert len(question(HeardBefore(rings), *at, begun_s - 60.0).heard()) == 1
 
 
 def test_the_test_of_a_neighbour_is_said_and_left_out(service: Service) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import Any
 
 import pytest
@@ -13,13 +14,13 @@ from loopwright.plantsim.catalogue import LaterPath
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.states.acceptance_watch import TroubleKind, WatchEnd
 from loopwright.service.states.job_state import JobState
-from loopwright.service.store import audit
+from loopwright.service.store import audit, job_knowledge
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.operation.model_conclusion import ModelState
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
-from tests.unit.service.jobs.watched import PU, WatchedLoop
+from tests.unit.service.jobs.watched import PU, TS, WatchedLoop
 
 CHANGES = (1.0, -1.0, 1.5)
 LATER = LaterPath(0.43, 4.0 * PU)
@@ -100,6 +101,110 @@ def test_a_loop_that_becomes_unstable_gets_its_old_gains_back(service: Service, 
     alarms(client)
     here.goes_on(3.0)
     assert service.store.get(here.job_id).state is JobState.ROLLED_BACK
+
+
+@pytest.mark.parametrize("by_s", [-3600.0, -5.0, 3600.0, 40 * 86_400.0])
+@pytest.mark.parametrize("restarted", [False, True])
+def test_the_old_gains_come_back_whatever_the_clock_is_set_to(by_s: float, restarted: bool, service: Service) -> None:
+    here = WatchedLoop(service, factor=unstable_from(10.0))
+    job_knowledge.keep(service.store, here.job_id, TAG, b"")
+    job_knowledge.outdated(service.store, here.job_id, datetime.now(UTC))  # its trial has shown another plant
+    here.accept()
+    here.goes_on(2.0)
+    if restarted:
+        here.watching = here.another()
+    here.clock_is_set(by_s)
+    here.goes_on(20.0, 1.0)
+    trouble = here.watch.trouble
+    assert trouble is not None and (trouble.kind, trouble.put_back) == (TroubleKind.GROWING_OSCILLATION, True)
+    assert service.controller.state.gains == OLD and here.watch.end is WatchEnd.ROLLED_BACK
+
+
+def test_a_clock_that_jumps_does_not_shorten_the_time_for_which_pv_is_outside(service: Service) -> None:
+    here = _limited(service)
+    here.plant.disturbance = 2.0
+    while here.pv <= 50.5:
+        here.steps(1)
+    here.watching.look()
+    here.clock_is_set(3600.0)
+    here.steps(1)
+    here.watching.look()
+    assert here.watch.trouble is None
+    here.clock_is_set(-3600.0)
+    here.steps(30)
+    here.watching.look()
+    assert here.watch.trouble is not None and here.watch.trouble.put_back
+
+
+def test_gains_that_were_read_before_the_acceptance_by_a_clock_that_was_ahead_are_not_of_others(
+    service: Service,
+) -> None:
+    here = WatchedLoop(service)
+    here.clock_is_set(600.0)
+    here.steps(3)
+    here.clock_is_set(-600.0)
+    here.ears.gains_are_read = False
+    here.accept()
+    here.goes_on(2.0)
+    assert here.watch.end is None
+
+
+@pytest.mark.parametrize("set_after", [0.5, 0.0], ids=["before the step", "after it"])
+def test_a_loop_that_leaves_automatic_as_the_clock_is_set_back_has_left_it(set_after: float, service: Service) -> None:
+    here = WatchedLoop(service)
+    here.accept()
+    here.goes_on(2.5)
+    service.controller.by_hand(mode=Mode.MANUAL)
+    here.goes_on(set_after)  # half a period: the history is not looked at in it
+    here.clock_is_set(-3600.0)
+    here.goes_on(0.5 - set_after)
+    service.controller.by_hand(mode=Mode.AUTOMATIC)
+    here.goes_on(5.0)
+    assert "the mode was changed at" in str(here.watch.disarmed) and not here.watch.armed
+
+
+def test_changes_are_compared_once_whatever_the_clock_is_set_to(service: Service) -> None:
+    here = WatchedLoop(service)
+    here.accept()
+    for count, size in enumerate(CHANGES, 1):
+        here.goes_on(2.0)
+        here.goes_on(13.0, size)
+        here.steps(round(PU / TS))
+        here.watching.look()
+        here.clock_is_set(-60.0)
+        here.watching.look()
+        here.watching.compare()  # what was heard before the clock was set
+        assert len(here.watch.changes) == here.watch.conclusion().confirmed == count
+    here.goes_on(1.0)
+    assert here.watch.end is WatchEnd.COMPLETE
+
+
+def test_a_watch_ends_after_a_month_that_has_passed(service: Service) -> None:
+    here = WatchedLoop(service)
+    here.accept()
+    here.goes_on(1.0)
+    here.clock_is_set(40 * 86_400.0)
+    for days in (0.0, 29.0):
+        here.now_s, here.passed_s = here.now_s + 86_400.0 * days, here.passed_s + 86_400.0 * days
+        here.goes_on(1.0)
+        assert here.watch.end is None
+    here.now_s, here.passed_s = here.now_s + 2 * 86_400.0, here.passed_s + 2 * 86_400.0
+    here.goes_on(1.0)
+    assert here.watch.end is WatchEnd.TOO_LONG
+
+
+@pytest.mark.parametrize("by_s", [0.0, -3600.0])
+def test_a_test_between_the_proposal_and_its_acceptance_is_no_next_retune(by_s: float, service: Service) -> None:
+    here = WatchedLoop(service)
+    service.wait(service.jobs.start(TAG, FastRetune()).id)
+    here.accept()
+    here.goes_on(1.0)
+    here.clock_is_set(by_s)
+    here.goes_on(2.0)
+    assert here.watch.end is None
+    service.wait(service.jobs.start(TAG, FastRetune()).id)
+    here.goes_on(1.0)
+    assert here.watch.end is WatchEnd.RETUNED
 
 
 def test_pv_that_leaves_its_limits_is_a_reason_too(service: Service) -> None:

@@ -39,8 +39,12 @@ class HeardAfter(HeardBefore):
         self.gains_are_read = True
         self.read: tuple[Gains, float] | None = None
 
-    def gains_read(self, tag: str) -> tuple[Gains, float] | None:
-        return self.read if tag == TAG else None
+    def gains_read_since(self, tag: str, since_s: float) -> Gains | None:
+        return self.read[0] if tag == TAG and self.read is not None and self.read[1] > since_s else None
+
+    def began_anew(self) -> None:
+        """Drops the history, as the process does that listens when the clock is put back."""
+        self.rings = self._rings = Rings()
 
 
 class PoolHere:
@@ -67,7 +71,7 @@ class WatchedLoop:
         self.service, self.factor = service, factor
         entry = Entry("", _FACTS, CatalogueModel((2.0,), (3.0, 1.0), 1.0), second_path)
         self.plant = entry.build(TS, noise_std=noise, seed=1)
-        self.now_s = time.time()
+        self.now_s, self.passed_s = time.time(), 1000.0
         self.n = 0
         self.ears = HeardAfter()
         gains = service.controller.state.gains
@@ -89,12 +93,20 @@ class WatchedLoop:
         """The watch of a service that is started on the same database."""
         jobs = self.service.jobs
         return Watching(
-            self.service.store, jobs.directory, jobs.decisions, self.ears, PoolHere(), lambda: self.now_s
+            self.service.store, jobs.directory, jobs.decisions, self.ears, PoolHere(),
+            lambda: self.now_s, lambda: self.passed_s,
         )  # type: ignore[arg-type]  # fmt: skip
 
     def accept(self, roll_back_by_itself: bool = True) -> None:
         self.service.jobs.decisions.accept(self.job_id, "operator A", roll_back_by_itself)
         self.now_s = max(self.now_s, time.time())  # the acceptance has the time of this machine
+
+    def clock_is_set(self, by_s: float) -> None:
+        """The wall clock jumps."""
+        self.now_s += by_s
+        if by_s < 0.0:
+            self.ears.began_anew()
+        self.gap = GAP_BEFORE
 
     @property
     def watch(self) -> AcceptanceWatch:
@@ -104,11 +116,11 @@ class WatchedLoop:
         """The loop goes on for so many ultimate periods, after a change of the set-point."""
         self.channel.setpoint += moved_by
         for _ in range(round(2.0 * periods)):
-            self._steps(round(0.5 * PU / TS))
+            self.steps(round(0.5 * PU / TS))
             self.watching.look()
             self.watching.compare()
 
-    def _steps(self, count: int) -> None:
+    def steps(self, count: int) -> None:
         controller, rings = self.service.controller, self.ears.rings
         for _ in range(count):
             gains = controller.state.gains
@@ -118,7 +130,7 @@ class WatchedLoop:
             if mode != self.channel.mode:
                 self.channel.command_mode(mode)
             mv = self.channel.step(self.pv)
-            self.now_s += TS
+            self.now_s, self.passed_s = self.now_s + TS, self.passed_s + TS
             self.n += 1
             if self.heard_at_all:
                 read = gains if self.ears.read is None or self.ears.gains_are_read else self.ears.read[0]
@@ -129,7 +141,7 @@ class WatchedLoop:
                 self.gap = GAP_BEFORE
             self.pv = self.plant.step(50.0 + self.factor(self.n) * (mv - 50.0))
         if self.ears.gains_are_read:
-            self.ears.read = controller.state.gains, self.now_s
+            self.ears.read = controller.state.gains, self.passed_s
         sp = self.channel.setpoint
         mode, sp = (UNKNOWN_MODE, math.nan) if self.frames_lost else (mode, sp)
         self.ears.heard = {} if not self.heard_at_all else {

@@ -10,14 +10,18 @@ import pytest
 
 from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.listening.bins import GAP_BEFORE, Rows, packed
+from loopwright.service.listening.heard_loop import InEffect
 from loopwright.service.listening.listening import HOLE_S, NOT_BEGUN, Listening
 from loopwright.service.listening.messages import HistoryAnswer
 from loopwright.service.listening.process import ListeningProcess
 from loopwright.service.listening.rings import Rings
 from loopwright.service.store import history
+from loopwright.service.store.clock_watch import uptime_s
 from loopwright.service.store.history import HistoryBlock
 from loopwright.service.store.store import Store
+from loopwright.tuning.gains import Gains
 from tests.unit.service.fakes import TAG, loop_entry
+from tests.unit.service.processes import until
 
 T0 = 1_769_860_800.0
 ONE = (1.5, 20.0, 0.0, 0.0, 1.0, 0.0)
@@ -130,3 +134,18 @@ def test_a_bus_is_not_called_heard_before_the_first_report(store: Store, monkeyp
     assert not listening.off and not listening.begun
     assert listening.why_not_heard(next(iter(site.loops))) == NOT_BEGUN and [*listening.buses().values()] == [NOT_BEGUN]
     listening.close()
+
+
+def test_a_reading_of_gains_has_the_time_that_nobody_sets(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("start", "close"):
+        monkeypatch.setattr(ListeningProcess, name, lambda process: None)
+    site = parse_site({"loops": [loop_entry() | {"bus": "socketcan:can0"}]}, "test")
+    clock_ahead_s = 4e9
+    listening = Listening(site.loops, store, lambda tag: InEffect(clock_ahead_s, 50.0, 2, False, ONE))
+    monkeypatch.setattr(listening, "_to_read", (TAG,))
+    before_s = uptime_s()
+    listening.start()
+    until(lambda: listening.gains_of(TAG) is not None)
+    listening.close()
+    assert listening.gains_read_since(TAG, before_s) == Gains(*ONE)
+    assert listening.gains_read_since(TAG, uptime_s()) is None
