@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,46 +19,69 @@ MISSING = frozenset(
 )  # fmt: skip
 """What stands in small letters where a historian had no good value."""
 
+_THOUSANDS = {".": ",", ",": "."}
+"""The sign that separates thousands beside each decimal sign; spaces do as well."""
+_GROUPS = {
+    decimal: re.compile(rf"(?<=\d)(?<!\d{{4}})[{sign} \u00a0\u202f](?=\d{{3}}(?!\d))|(?<=^[+-])\s+")
+    for decimal, sign in _THOUSANDS.items()
+}
+
 
 def is_missing(cell: str) -> bool:
     return cell.strip().lower() in MISSING
 
 
-def number(cell: str, decimal_comma: bool = True) -> float | None:
+def number(cell: str, decimal: str) -> float | None:
     """Returns the number in a cell, None where there is none.
 
-    decimal_comma: whether a comma alone is a decimal comma, which it is not where commas separate the cells.
+    decimal: the decimal sign, "." or ","; the other one separates thousands.
     """
-    text = cell.strip().rstrip("%").replace(" ", "").replace("\u00a0", "").replace("\u202f", "")
-    if "," in text and "." in text:  # the last of the two signs is the decimal one
-        thousands = "," if text.rindex(".") > text.rindex(",") else "."
-        text = text.replace(thousands, "")
-        text = text.replace(",", ".")
-    elif decimal_comma:
-        text = text.replace(",", ".")
-    if not text or "_" in text:  # Python's own way to write thousands
+    thousands = _THOUSANDS[decimal]
+    text = _GROUPS[decimal].sub("", cell.strip().rstrip("%").strip())
+    if not text or thousands in text or "_" in text:
         return None
     try:
-        return float(text)
+        return float(text.replace(",", "."))
     except ValueError:
         return None
 
 
-def numbers(cells: Sequence[str], decimal_comma: bool) -> tuple[Reals, list[int]]:
-    """Returns the numbers of a column, NaN where the historian had no value, and the places of what is no number."""
-    try:
-        values = np.array(cells, dtype=float)
-        if np.all(np.isfinite(values)) and not any("_" in cell for cell in cells):
-            return values, []
-    except ValueError:
-        pass
+def is_number(cell: str) -> bool:
+    """Whether a cell has a number, whichever sign is the decimal one."""
+    return any(number(cell, decimal) is not None for decimal in _THOUSANDS)
+
+
+def numbers(cells: Sequence[str], decimal: str) -> tuple[Reals, list[int]]:
+    """Returns the numbers of a column, NaN where the historian had no value, and the places of what is no number.
+
+    decimal: the decimal sign, as in `number`.
+    """
+    text = "\n".join(cells)
+    if "_" not in text:  # Python's own way to write thousands
+        plain: Sequence[str] = cells
+        if "," in text or decimal == ",":
+            plain = text.replace(_THOUSANDS[decimal], "").replace(",", ".").split("\n")
+        if (found := _at_once(plain)) is not None:
+            return found, []
+        plain = ["nan" if is_missing(cell) else each for cell, each in zip(cells, plain, strict=True)]
+        if (found := _at_once(plain)) is not None:
+            return found, []
     values, wrong = np.full(len(cells), np.nan), []
     for i, cell in enumerate(cells):
         if is_missing(cell):
             continue
-        value = number(cell, decimal_comma)
+        value = number(cell, decimal)
         if value is None or not math.isfinite(value):
             wrong.append(i)
         else:
             values[i] = value
     return values, wrong
+
+
+def _at_once(cells: Sequence[str]) -> Reals | None:
+    """The numbers of a long column in a fraction of the time; None where one is to be looked at by itself."""
+    try:
+        values = np.array(cells, dtype=float)
+    except ValueError:
+        return None
+    return None if np.any(np.isinf(values)) else values

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from loopwright.service.offline.csv_record.columns import SHOWN
+from loopwright.service.offline.csv_record.decimal_signs import decimal_signs, shown_signs
 from loopwright.service.offline.csv_record.errors import RecordError, Unusable, counted
 from loopwright.service.offline.csv_record.numbers import numbers
 from loopwright.service.offline.csv_record.sampling import sampled
 from loopwright.service.offline.csv_record.table import Table, read_table
 from loopwright.service.offline.csv_record.text import decoded
-from loopwright.service.offline.csv_record.times import seconds
+from loopwright.service.offline.csv_record.times import are_numbers, seconds
 from loopwright.tuning.models import Reals
 
 
@@ -83,24 +83,31 @@ def _record(table: Table, options: ReadOptions) -> Record:
     at, names = table.columns.at, table.columns.names
     values: dict[str, Reals] = {}
     problems = list(table.problems)
+    called = {quantity: names[place].strip() for quantity, place in at.items()}
+    cells = {quantity: [row[place] for row in table.rows] for quantity, place in at.items()}
+    cells["t"] = _time_cells(table)
+    called["t"] = called["t"] or "the first column"
+    numeric = {each: cells[each] for each in cells if each != "t" or are_numbers(cells["t"], options.time_format)}
+    decimal, notes = decimal_signs(numeric, called, table.delimiter)
     for quantity in ("u", "y", "sp"):
         if quantity in at:
-            cells = [row[at[quantity]] for row in table.rows]
-            values[quantity], wrong = numbers(cells, decimal_comma=table.delimiter != ",")
-            problems += _no_numbers(names[at[quantity]].strip(), cells, [table.lines[i] for i in wrong], wrong)
+            values[quantity], wrong = numbers(cells[quantity], decimal[quantity])
+            problems += _no_numbers(called[quantity], cells[quantity], [table.lines[i] for i in wrong], wrong)
     try:
-        t = _times(table, options)
+        unit = table.columns.units.get("t", "")
+        t = seconds(cells["t"], table.lines, unit, options.time_format, called["t"], decimal.get("t", "."))
+        t = t + _milliseconds(table)
     except Unusable as error:
         problems = [*error.problems, *problems]
     if problems:
         raise Unusable(*problems)
     found = sampled(t, values, table.lines, options.resample_s)
-    notes = list(found.notes)
+    notes += found.notes
     if table.skipped:
         above = "line" if table.skipped == 1 else "lines"
         notes.insert(0, f"{table.skipped} {above} above the names of the columns were not used.")
     columns = found.columns
-    used = {quantity: names[at[quantity]].strip() for quantity in values}
+    used = {quantity: called[quantity] for quantity in values}
     units = {quantity: unit for quantity, unit in table.columns.units.items() if quantity in values}
     return Record(found.t, columns["u"], columns["y"], columns.get("sp"), units, used, tuple(notes))
 
@@ -113,17 +120,20 @@ def _no_numbers(name: str, cells: list[str], lines: list[int], wrong: list[int])
     return [counted(lines, f"{name} is not a number: {given!r}", many)]
 
 
-def _times(table: Table, options: ReadOptions) -> Reals:
+def _time_cells(table: Table) -> list[str]:
+    at, date = table.columns.at["t"], table.columns.date
+    if date is None:
+        return [row[at] for row in table.rows]
+    return [f"{row[date].strip()} {row[at].strip()}" for row in table.rows]
+
+
+def _milliseconds(table: Table) -> Reals | float:
+    """What the column of milliseconds adds to the times, s."""
     columns = table.columns
-    if "t" not in columns.at:
-        raise Unusable(f"no column for {SHOWN['t']}")
-    cells = [row[columns.at["t"]] for row in table.rows]
-    if columns.date is not None:
-        cells = [f"{row[columns.date].strip()} {cell.strip()}" for row, cell in zip(table.rows, cells, strict=True)]
-    unit, name = columns.units.get("t", ""), columns.names[columns.at["t"]].strip() or "the first column"
-    t = seconds(cells, table.lines, unit, options.time_format, name)
-    if columns.milliseconds is not None and columns.milliseconds != columns.at["t"]:
-        fractions, wrong = numbers([row[columns.milliseconds] for row in table.rows], decimal_comma=True)
-        if not wrong and np.all((fractions >= 0.0) & (fractions < 1000.0)):
-            t = t + fractions / 1000.0
-    return t
+    if columns.milliseconds is None or columns.milliseconds == columns.at["t"]:
+        return 0.0
+    cells = [row[columns.milliseconds] for row in table.rows]
+    fractions, wrong = numbers(cells, "," if "," in shown_signs(cells) else ".")
+    if wrong or not np.all((fractions >= 0.0) & (fractions < 1000.0)):
+        return 0.0
+    return fractions / 1000.0

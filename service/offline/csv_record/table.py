@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from loopwright.service.offline.csv_record.columns import NAMES, Columns, find_columns
 from loopwright.service.offline.csv_record.errors import Unusable, counted
-from loopwright.service.offline.csv_record.numbers import is_missing, number
+from loopwright.service.offline.csv_record.numbers import is_missing, is_number
 from loopwright.service.offline.csv_record.time_units import seconds_in
 
 DELIMITERS = (",", ";", "\t", " ")
@@ -117,11 +117,11 @@ def _is_sample(cells: Sequence[str], columns: Columns) -> bool:
     """Whether a line has a number for the time, MV or PV, or says that there is none."""
     if len(cells) < max(columns.at.values()) + 1:
         return False
-    if number(cells[columns.at["t"]]) is not None:
+    if is_number(cells[columns.at["t"]]):
         return True
     for quantity in ("u", "y"):
         cell = cells[columns.at[quantity]]
-        if cell.strip() and (is_missing(cell) or number(cell) is not None):
+        if cell.strip() and (is_missing(cell) or is_number(cell)):
             return True
     return False
 

@@ -38,21 +38,29 @@ Parts = tuple[str, str, str, str, float]
 """The three parts of a date, the sign between them, and the seconds since midnight."""
 
 
-def seconds(cells: Sequence[str], lines: Sequence[int], unit: str, form: str | None, name: str) -> Reals:
+def are_numbers(cells: Sequence[str], form: str | None) -> bool:
+    """Whether the times of a column are numbers, which have no sign of a date or a time of day."""
+    first = cells[0].strip()
+    return form is None and ":" not in first and not _has_date(first)
+
+
+def seconds(
+    cells: Sequence[str], lines: Sequence[int], unit: str, form: str | None, name: str, decimal: str = "."
+) -> Reals:
     """Returns the times of a column, s; those with a date, or that count from an epoch, from the first one on.
 
     unit: the unit of times that are numbers ("" for s).
     form: how times are written, as `datetime.strptime` describes it, or None to find out.
     name: the name of the column, for errors.
+    decimal: the decimal sign of times that are numbers.
     Raises Unusable, naming the lines.
     """
     if form is not None:
         moments = _each(cells, lines, name, lambda cell: _by_form(cell, form), f"of the form {form!r}")
         return _from_first(np.array(moments))
-    first = cells[0].strip()
-    if ":" not in first and not _has_date(first):
-        return _of_numbers(cells, lines, unit, name)
-    if _MINUTES_FIRST.match(unit) and first.count(":") == 1:
+    if are_numbers(cells, form):
+        return _of_numbers(cells, lines, unit, name, decimal)
+    if _MINUTES_FIRST.match(unit) and cells[0].count(":") == 1:
         cells = [f"0:{cell.strip()}" for cell in cells]
     try:
         return _from_first(np.array([_iso(cell) for cell in cells]))
@@ -97,10 +105,10 @@ def _each(
     return found
 
 
-def _of_numbers(cells: Sequence[str], lines: Sequence[int], unit: str, name: str) -> Reals:
+def _of_numbers(cells: Sequence[str], lines: Sequence[int], unit: str, name: str, decimal: str) -> Reals:
     if (moments := compact_dates(cells)) is not None:
         return _from_first(moments)
-    times, wrong = numbers(cells, decimal_comma=True)
+    times, wrong = numbers(cells, decimal)
     wrong = sorted({*wrong, *np.flatnonzero(np.isnan(times)).tolist()})
     if wrong:
         places = [lines[i] for i in wrong]

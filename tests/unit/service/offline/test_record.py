@@ -269,6 +269,51 @@ def test_numbers_as_people_write_them(cell: str, value: float) -> None:
     assert values(parse_record(f"t;u;y\n0;{cell};2\n1;{cell};2\n", "log.csv").u) == [value, value]
 
 
+@pytest.mark.parametrize(
+    ("delimiter", "cells", "found", "note"),
+    [
+        (";", ("0;35,00;1.200", "5;35,00;1.130"), [1200.0, 1130.0], "The point of y ('1.200') was taken to separate"),
+        ("\t", ("0\t35.00\t1,200", "5\t35.00\t998"), [1200.0, 998.0], "The comma of y ('1,200') was taken to separate"),
+        (",", ('0,35.00,"1,200"', '5,35.00,"998"'), [1200.0, 998.0], "The comma of y ('1,200') was taken to separate"),
+        (";", ("0;35;1,200.5", "5;35;1,201"), [1200.5, 1201.0], ""),
+        (";", ("0;35;1,234,567", "5;35;1,201"), [1234567.0, 1201.0], ""),
+        (";", ("0;35;1 234,567", "5;35;1,201"), [1234.567, 1.201], ""),
+        (";", ("0;35;0,125", "5;35;1,201"), [0.125, 1.201], ""),
+        (",", ('0,"35,5","60,25"', '5,"35,5","60,5"'), [60.25, 60.5], ""),
+        (";", ("0;35,5;60,016", "5;35,5;Bad", "10;35,5;60,018"), [60.016, 60.017, 60.018], ""),
+        (";", ("0;35;998", "5;35;1,000"), [998.0, 1000.0], "to separate thousands: otherwise values would jump"),
+        (";", ("0;35;35", "5;35;41,125"), [35.0, 41.125], "for the decimal sign: otherwise values would jump"),
+        (";", ("0;35;1,200", "5;35;1,201"), [1.2, 1.201], "for the decimal sign, which no number of it shows; if it"),
+        (";", ("0;35;1.200", "5;35;1.201"), [1.2, 1.201], "for the decimal sign, which no number of it shows; if it"),
+        (",", ("0,35,1.200", "5,35,1.201"), [1.2, 1.201], ""),
+        (",", ('0,35,"1,200"', '5,35,"1,201"'), [1200.0, 1201.0], "to separate thousands, which no number of it shows"),
+    ],
+)  # fmt: skip
+def test_thousands_and_decimals(delimiter: str, cells: tuple[str, ...], found: list[float], note: str) -> None:
+    allowing_gaps = ReadOptions(resample_s=5.0) if any("Bad" in cell for cell in cells) else ReadOptions()
+    record = parse_record(delimiter.join("tuy") + "\n" + "\n".join(cells) + "\n", "log.csv", allowing_gaps)
+    assert values(record.y) == pytest.approx(found, rel=1e-12)
+    taken = [each for each in record.notes if " was taken " in each]
+    assert len(taken) == bool(note) and all(note in each for each in taken)
+
+
+def test_thousands_in_times() -> None:
+    quoted = parse_record('"time (s)","u","y"\n"995","35.00","2.5"\n"1,000","35.00","2.5"\n', "log.csv")
+    assert values(quoted.t) == [995.0, 1000.0]
+    assert values(parse_record("t\tu\ty\n995\t1\t2\n1,000\t1\t2\n1,005\t1\t2\n", "log.csv").t) == [
+        995.0,
+        1000.0,
+        1005.0,
+    ]
+
+
+def test_numbers_that_cannot_be_read_alike() -> None:
+    with pytest.raises(RecordError, match=r"y has numbers with point and with comma: '1\.5' and '2,5'; write one"):
+        parse_record("t;u;y\n0;1;1.5\n1;1;2,5\n", "log.csv")
+    with pytest.raises(RecordError, match=r"2 values of t are not numbers as those before, such as '20261125 90000'"):
+        parse_record("t;u;y\n20261125 90000;1;2\n20261125 90100;1;2\n", "log.csv")
+
+
 def test_columns_by_number_where_there_are_no_names() -> None:
     reading = ReadOptions({"t": "1", "u": "3", "y": "2"})
     for text in ("0 5 1\n2 6 1\n", "  0   5   1\n  2   6   1\n", "0\t5\t1\n2\t6\t1\n"):
