@@ -47,7 +47,7 @@ def exported(record: Record, gains: Gains, spec: DesignSpec) -> ExportedView:
     Raises Refused: BAD_INPUT for a file that does not show the loop itself, SETPOINT_IS_DRIVEN.
     """
     if record.sp is None:
-        text = "the file has no column of SP, which the gains of a loop in automatic need: export SP with it"
+        text = f"{record.without_setpoint}, which the gains of a loop in automatic need: export SP with it"
         raise Refused(Reason.BAD_INPUT, text)
     if len(record.t) < FEWEST:
         raise Refused(Reason.BAD_INPUT, f"the file has {len(record.t)} samples; at least {FEWEST} are needed")

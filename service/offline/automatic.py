@@ -75,7 +75,7 @@ def _why(record: Record, found: InAutomatic) -> str:
     if not control.certain:
         return "MV has many values, as the output of a controller has"
     if not control.setpoint_moves:
-        rests = "the file has no column of SP" if record.sp is None else "SP rests"
+        rests = record.without_setpoint if record.sp is None else "SP rests"
         return f"MV follows PV, as in automatic, and {rests}"
     times = "once" if control.setpoint_moves == 1 else f"{control.setpoint_moves} times"
     if found.law:

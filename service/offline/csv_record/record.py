@@ -47,7 +47,7 @@ class Record:
     y: PV, PV units.
     sp: set-point, PV units; None if the file has none.
     units: the unit of u, y and sp where the file names it.
-    names: the column that u, y and sp were read from.
+    names: the column that u, y and sp were read from; that of sp also where it was left out for want of values.
     notes: what was changed when the file was read, one sentence each.
     """
 
@@ -58,6 +58,13 @@ class Record:
     units: Mapping[str, str] = field(default_factory=dict)
     names: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    @property
+    def without_setpoint(self) -> str:
+        """Why there is no set-point, as the end of a sentence."""
+        if "sp" not in self.names:
+            return "the file has no column of SP"
+        return f"the column of SP ({self.names['sp']}) lacks too many values"
 
 
 def load_record(path: Path, options: ReadOptions = ReadOptions()) -> Record:

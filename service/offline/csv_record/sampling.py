@@ -23,6 +23,8 @@ MAX_GAP = 3
 MAX_FILLED = 0.05
 """Largest part of the samples that is filled."""
 MAX_SAMPLES = 10_000_000
+_NEEDED = ("u", "y")
+"""The columns by which a sample is missing."""
 _HELD = ("u", "sp")
 """What holds its value until the next sample; PV goes on in a straight line."""
 _DURATION = re.compile(r"^\s*(?P<number>\d+(?:[.,]\d+)?)\s*(?P<unit>ms|s|sec|min|m|h)?\s*$")
@@ -132,15 +134,16 @@ def _rows_filled_in(t: Reals, values: Mapping[str, Reals], lines: Whole) -> tupl
 
 def _filled(t: Reals, values: Mapping[str, Reals], notes: list[str]) -> EvenSamples:
     """The samples without those at the ends that lack a value, and with short gaps filled. Raises Unusable."""
-    missing = np.any([np.isnan(column) for column in values.values()], axis=0)
+    missing = np.any([np.isnan(values[name]) for name in _NEEDED], axis=0)
     there = np.flatnonzero(~missing)
     if not len(there):
-        raise Unusable("no sample has values of all columns")
+        raise Unusable("no sample has values of all columns: MV and PV")
     first, last = int(there[0]), int(there[-1]) + 1
+    values = _without_sparse_setpoint({name: column[first:last] for name, column in values.items()}, notes)
     if cut := len(t) - (last - first):
         notes.append(f"{_count(cut, 'sample', 'samples')} without values at the ends {_were(cut)} left out.")
-    t, missing = t[first:last], missing[first:last]
-    columns = {name: column[first:last].copy() for name, column in values.items()}
+    t, missing = t[first:last], np.any([np.isnan(column) for column in values.values()], axis=0)
+    columns = {name: column.copy() for name, column in values.items()}
     filled = int(np.count_nonzero(missing))
     if not filled:
         return EvenSamples(t, columns, tuple(notes))
@@ -164,7 +167,34 @@ def _filled(t: Reals, values: Mapping[str, Reals], notes: list[str]) -> EvenSamp
     return EvenSamples(t, columns, tuple(notes))
 
 
+def _without_sparse_setpoint(values: dict[str, Reals], notes: list[str]) -> dict[str, Reals]:
+    """The columns without a set-point that lacks more values than are filled: a test in open loop does not need it."""
+    if "sp" not in values:
+        return values
+    missing = np.isnan(values["sp"])
+    lacking = int(np.count_nonzero(missing))
+    if not lacking or (_longest_run(missing)[0] <= MAX_GAP and lacking <= MAX_FILLED * len(missing)):
+        return values
+    notes.append(
+        f"The set-point was left out: {lacking} of {len(missing)} samples have no value of it, more than are filled."
+    )
+    return {name: values[name] for name in _NEEDED}
+
+
+def _without_late_setpoint(t: Reals, values: Mapping[str, Reals], notes: list[str]) -> dict[str, Reals]:
+    """The same for samples at uneven times: the set-point holds, but nothing is known of it before its first value."""
+    if "sp" not in values:
+        return dict(values)
+    there = t[~np.isnan(values["sp"])]
+    if len(there) > 1 and there[0] - t[0] <= MAX_FILLED * (t[-1] - t[0]):
+        return dict(values)
+    known = f"has its first of {len(there)} values at {there[0]:.6g} s" if len(there) else "has no value"
+    notes.append(f"The set-point was left out: it {known}, the record begins at {t[0]:.6g} s.")
+    return {name: values[name] for name in _NEEDED}
+
+
 def _resampled(t: Reals, values: Mapping[str, Reals], Ts: float, notes: list[str]) -> EvenSamples:
+    values = _without_late_setpoint(t, values, notes)
     there = {name: t[~np.isnan(column)] for name, column in values.items()}
     if any(len(each) < 2 for each in there.values()):
         raise Unusable("a column has fewer than two values: there is nothing to resample")

@@ -90,6 +90,15 @@ def test_whose_set_point_rests_tells_nothing(tmp_path: Path) -> None:
     assert "take a time in which operators moved SP" in asked.stderr
 
 
+def test_a_set_point_without_values_is_asked_for(tmp_path: Path) -> None:
+    lines = LOADED["scada"].content.decode("utf-16").splitlines(keepends=True)
+    lines = [lines[0], *("\t".join([line.split("\t")[0], "Bad", *line.split("\t")[2:]]) for line in lines[1:])]
+    without = ExportedFile("without", "".join(lines).encode("utf-16"))
+    asked = identify(without, tmp_path, "--kp", str(KP), "--ti", str(TI))
+    assert asked.exit_code == 2 and "the column of SP (TIC101.SP) lacks too many values" in asked.stderr
+    assert "export SP with it" in asked.stderr
+
+
 def test_who_says_that_the_loop_was_open_is_not_asked(tmp_path: Path) -> None:
     said = identify(LOADED["plain"], tmp_path, "--open-loop", "--json")
     assert said.exit_code == 0 and answer(said)["explained"] is False

@@ -361,6 +361,33 @@ def test_values_that_are_missing() -> None:
         parse_record(rows("", "", "nan"), "log.csv")
 
 
+@pytest.mark.parametrize(
+    ("setpoints", "lacking"), [(["Bad"] * 60, 60), (["60", *[""] * 4] * 12, 48), ([*[""] * 40, *["60"] * 20], 40)]
+)
+def test_a_set_point_that_lacks_values_costs_no_sample(setpoints: list[str], lacking: int) -> None:
+    text = "t,u,y,sp\n" + "".join(f"{k},1,{k},{sp}\n" for k, sp in enumerate(setpoints))
+    record = parse_record(text, "log.csv")
+    assert record.sp is None and values(record.y) == [float(k) for k in range(60)]
+    assert record.notes == (
+        f"The set-point was left out: {lacking} of 60 samples have no value of it, more than are filled.",
+    )
+    assert record.without_setpoint == "the column of SP (sp) lacks too many values"
+
+
+def test_a_set_point_with_a_few_gaps_is_filled_as_before() -> None:
+    text = "t,u,y,sp\n" + "".join(f"{k},1,{k},{'' if k in (0, 30, 31) else 60}\n" for k in range(60))
+    record = parse_record(text, "log.csv")
+    assert values(record.sp) == [60.0] * 60 and len(record.notes) == 1 and "3 samples without" in record.notes[0]
+
+
+@pytest.mark.parametrize(("first", "there"), [(1, True), (40, False), (60, False)])
+def test_a_set_point_that_begins_late_costs_no_resampled_record(first: int, there: bool) -> None:
+    text = "t,u,y,sp\n" + "".join(f"{k},1,{k},{60 if k >= first else ''}\n" for k in range(60))
+    record = parse_record(text, "log.csv", ReadOptions(resample_s=1.0))
+    assert (record.sp is not None) is there and len(record.t) == (59 if there else 60)
+    assert there or record.notes[0].startswith("The set-point was left out: it has ")
+
+
 def test_lines_that_are_missing_or_repeated() -> None:
     lines = [f"{k},1,{k}" for k in range(100)]
     record = parse_record("\n".join(["t,u,y", *lines[:50], lines[49], *lines[52:]]), "log.csv")
