@@ -27,7 +27,7 @@ _NEEDED = ("u", "y")
 """The columns by which a sample is missing."""
 _HELD = ("u", "sp")
 """What holds its value until the next sample; PV goes on in a straight line."""
-_DURATION = re.compile(r"^\s*(?P<number>\d+(?:[.,]\d+)?)\s*(?P<unit>ms|s|sec|min|m|h)?\s*$")
+_DURATION = re.compile(r"^\s*(?P<number>(?![1-9]\d{0,2},\d{3}(?!\d))\d+(?:[.,]\d+)?)\s*(?P<unit>ms|s|sec|min|m|h)?\s*$")
 _SECONDS = {"ms": 1e-3, "s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 
 

@@ -419,7 +419,7 @@ def test_durations(text: str, s: float) -> None:
     assert duration(text) == s
 
 
-@pytest.mark.parametrize("text", ["", "s", "0s", "-5s", "5 days", "nan"])
+@pytest.mark.parametrize("text", ["", "s", "0s", "-5s", "5 days", "nan", "1,000ms"])
 def test_what_is_no_duration(text: str) -> None:
     with pytest.raises(ValueError, match="a time such as 5s"):
         duration(text)
