@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -12,6 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
+
+ROUNDING = 1e-13
+"""What is smaller than this part of the terms that it is the sum of is rounding."""
+MANY_CHANNELS = "the transfer function has more than one input or output"
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,28 +243,64 @@ def as_model(system: Model | LinearSystem | tuple[ArrayLike, ArrayLike], dead_ti
 
 def _of_another_library(given: Any, dead_time_s: float) -> TransferFunction:
     """The model for an object of control or scipy.signal; raises as `as_model`."""
-    system = _as_fraction(given)
-    if not all(hasattr(system, name) for name in ("num", "den", "dt")):
+    is_state_space = all(hasattr(given, name) for name in ("A", "B", "C", "D", "dt"))
+    system = given.to_tf() if hasattr(given, "to_tf") and not is_state_space else given
+    if not (is_state_space or all(hasattr(system, name) for name in ("num", "den", "dt"))):
         raise TypeError(
             f"{type(given).__name__} is no model: give FOPDT(K, T, L), SOPDT, Integrating, TransferFunction(num, den, "
             "L), or a transfer function of control or scipy.signal"
         )
     if system.dt:
         raise ValueError(f"the transfer function is in discrete time (dt={system.dt}): a model here is continuous")
-    num, den = (np.squeeze(np.asarray(each, dtype=float)) for each in (system.num, system.den))
-    if num.ndim > 1 or den.ndim > 1:
-        raise ValueError("the transfer function has more than one input or output")
-    return TransferFunction(tuple(np.atleast_1d(num).tolist()), tuple(np.atleast_1d(den).tolist()), dead_time_s)
+    if is_state_space:
+        num, den = _of_state_space(*(np.atleast_2d(np.asarray(getattr(given, name), dtype=float)) for name in "ABCD"))
+    else:
+        num, den = _only_channel(system.num), _only_channel(system.den)
+    return TransferFunction(tuple(num.tolist()), tuple(den.tolist()), dead_time_s)
 
 
-def _as_fraction(system: Any) -> Any:
-    """scipy's zeros and poles, and its state space, as its transfer function; anything else as it is."""
-    if not hasattr(system, "to_tf"):
-        return system
-    with warnings.catch_warnings():
-        # scipy calls a numerator badly conditioned whose first coefficients are 0, as they are for a state space
-        warnings.filterwarnings("ignore", message="Badly conditioned filter coefficients")
-        return system.to_tf()
+def _only_channel(nested: Any) -> Reals:
+    """The coefficients of the system's only channel. Raises ValueError for more than one."""
+    while len(nested) == 1 and hasattr(nested[0], "__len__"):
+        nested = nested[0]
+    if any(hasattr(each, "__len__") for each in nested):
+        raise ValueError(MANY_CHANNELS)
+    return np.asarray(nested, dtype=float)
+
+
+def _of_state_space(A: Reals, B: Reals, C: Reals, D: Reals) -> tuple[Reals, Reals]:
+    """Numerator and denominator of a state space, without the coefficients that are rounding: the first of the
+    numerator, and the last of the denominator of a plant that integrates. Raises ValueError for more than one channel.
+    """
+    from scipy.signal import ss2tf
+
+    if B.shape[1] != 1 or C.shape[0] != 1:
+        raise ValueError(MANY_CHANNELS)
+    # ss2tf subtracts B C from A: the gain is taken in a unit that makes their entries comparable
+    largest_a, largest_b, largest_c = (float(np.max(np.abs(each))) for each in (A, B, C))
+    unit = largest_b * largest_c / largest_a if largest_a and largest_b and largest_c else 1.0
+    rows, den = ss2tf(A, B, C / unit, D / unit)
+    num = unit * rows[0]
+    # The first coefficients are 0 as long as the slopes C A^k B of the response to an impulse are. Each is judged by
+    # the sizes of its own terms, which do not depend on the units of time, states and gain.
+    slope, size = B, np.abs(B)
+    for k in range(1, len(den) - 1 if D[0, 0] == 0.0 else 0):
+        if abs(C @ slope)[0, 0] > ROUNDING * (np.abs(C) @ size)[0, 0]:
+            break
+        num[k] = 0.0
+        slope, size = A @ slope, np.abs(A) @ size
+    if _is_singular(A):
+        den[-1] = 0.0
+    return num, den
+
+
+def _is_singular(A: Reals) -> bool:
+    """Whether changes of its entries by the part ROUNDING of each may make the matrix singular."""
+    try:
+        nearest = np.linalg.eigvals(np.abs(np.linalg.inv(A)) @ np.abs(A))
+    except np.linalg.LinAlgError:
+        return True
+    return bool(np.max(np.abs(nearest)) * ROUNDING > 1.0)
 
 
 def time_constants(model: Model) -> Reals:

@@ -6,6 +6,7 @@ import pydoc
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any
 
 import control
 import numpy as np
@@ -59,11 +60,59 @@ def test_models_of_other_libraries_are_tuned(system: tuning.Model) -> None:
     assert np.allclose(found.model.frequency_response(w), PLANT.frequency_response(w))
 
 
+def in_other_states(num: list[float], den: list[float], seed: int) -> Any:
+    """The state space of a fraction in states that are random sums of those that control takes."""
+    T = np.random.default_rng(seed).standard_normal((len(den) - 1, len(den) - 1))
+    return control.similarity_transform(control.ss(control.tf(num, den)), T)
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize(
+    ("num", "den"),
+    [
+        ([2.0], [100.0, 80.0, 17.0, 1.0]),
+        ([1e-8], [100.0, 80.0, 17.0, 1.0]),
+        ([-3e6], [100.0, 80.0, 17.0, 1.0]),
+        ([0.3], [7.3, 1.0, 0.0]),
+        ([0.3], [20.0, 12.0, 1.0, 0.0]),
+        # a slow pole, a fast zero and a slow one, each a millionth of the others or a million times as fast
+        ([2.0], [1e6, 1e6, 1.0]),
+        ([-1e-6, 1.0], [1.0, 1.6, 0.65, 0.05]),
+        ([1.0, 1e-6], [1.0, 1.6, 0.65, 0.05]),
+        ([1.0, 2.0], [3.0, 1.0]),
+    ],
+)
+def test_a_state_space_has_the_coefficients_of_its_fraction(num: list[float], den: list[float], seed: int) -> None:
+    system = in_other_states(num, den, seed)
+    for each in (system, signal.StateSpace(system.A, system.B, system.C, system.D)):
+        found = tuning.as_model(each, 1.0)
+        assert (len(found.num), len(found.den), found.den[-1] == 0.0) == (len(num), len(den), den[-1] == 0.0)
+        np.testing.assert_allclose(np.array(found.num) * den[0], num, rtol=1e-4)
+        np.testing.assert_allclose(np.array(found.den) * den[0], den, rtol=1e-4)
+
+
+LAGS, TANK = [100.0, 80.0, 17.0, 1.0], [7.3, 1.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("rule", "den"),
+    [*((rule, LAGS) for rule in ("simc", "lambda", "amigo", "robust", "imc-pid")), ("simc", TANK), ("lambda", TANK)],
+)
+def test_a_state_space_is_tuned_as_its_fraction(rule: str, den: list[float]) -> None:
+    expected = tuning.tune(control.tf([2.0], den), rule, dead_time_s=1.0).gains
+    for system in (control.ss(control.tf([2.0], den)), in_other_states([2.0], den, 1)):
+        found = tuning.tune(system, rule, dead_time_s=1.0).gains
+        assert (found.Kp, found.Ti, found.Td) == pytest.approx((expected.Kp, expected.Ti, expected.Td), rel=1e-6)
+
+
 @pytest.mark.parametrize(
     ("system", "dead_time_s", "why"),
     [
         (control.tf([1.0], [1.0, 0.5], 0.1), 0.0, "discrete time"),
         (control.tf([[[1.0], [1.0]]], [[[1.0, 1.0], [2.0, 1.0]]]), 0.0, "more than one"),
+        (control.tf([[[1.0], [2.0, 1.0]]], [[[1.0, 1.0], [1.0, 2.0, 3.0]]]), 0.0, "more than one"),
+        (signal.StateSpace(-np.eye(2), np.eye(2), [[0.0, 1.0]], [[0.0, 0.0]]), 0.0, "more than one"),
+        (signal.StateSpace(-np.eye(2), [[1.0], [1.0]], np.eye(2), np.zeros((2, 1))), 0.0, "more than one"),
         (PLANT, 2.0, "one too many"),
     ],
 )
