@@ -93,6 +93,26 @@ def test_half_rule_of_an_integrating_model() -> None:
     assert pytest.approx((0.2, 2.5, 1.0), rel=1e-9) == (kept.K, kept.T, kept.L)
 
 
+@pytest.mark.parametrize("T", [0.1, 1.0, 3.7, 27.0, 1000.0])
+@pytest.mark.parametrize("n", [5, 6, 7, 8, 10, 12])
+def test_equal_lags_of_a_high_order(n: int, T: float) -> None:
+    """The computed poles of n equal lags are complex, up to 0.17 of their size."""
+    found = half_rule(of_lags(2.0, [T] * n, [], 0.5 * T))
+    assert isinstance(found, FOPDT)
+    assert pytest.approx([2.0, 1.5 * T, (n - 1.0) * T], rel=1e-6) == [found.K, found.T, found.L]
+    second = half_rule(of_lags(2.0, [T] * n, [], 0.5 * T, origin=True), 2)
+    assert isinstance(second, Integrating)
+    assert pytest.approx([2.0, 1.5 * T, (n - 1.0) * T], rel=1e-6) == [second.K, second.T, second.L]
+
+
+@pytest.mark.parametrize(("n", "zeta"), [(3, 0.9999), (6, 0.9999), (8, 0.998), (10, 0.99), (12, 0.97), (20, 0.97)])
+def test_a_plant_that_oscillates_is_refused_at_any_order(n: int, zeta: float) -> None:
+    lags = of_lags(1.0, [0.6**k for k in range(n - 2)], [], 0.0)
+    model = TransferFunction(lags.num, tuple(np.polymul(lags.den, [9.0, 6.0 * zeta, 1.0])), 1.0)
+    with pytest.raises(Refused, match="complex"):
+        half_rule(model)
+
+
 @given(T=st.floats(0.1, 10.0), ratio=st.floats(0.01, 1.0))
 def test_a_model_of_that_order_is_left_alone(T: float, ratio: float) -> None:
     for model, order in ((FOPDT(1.0, T, 1.0), 1), (Integrating(1.0, 1.0, T), 2)):
