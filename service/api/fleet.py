@@ -36,7 +36,9 @@ class RetuneLoopView(BaseModel):
 
     loop: str = Field(examples=["TIC-101"])
     state: str = Field(
-        description="waiting, skipped (the loop was never begun), or the state of its job", examples=["proposed"]
+        description="waiting, skipped (the loop was never begun, or not again after a stop of the service), or the "
+        "state of its job",
+        examples=["proposed"],
     )
     job: str | None = Field(description="URL of the loop's job; null: there is no job", examples=["/jobs/4f0c2a9be113"])
     reason: Reason | None = Field(

@@ -55,7 +55,10 @@ class RetuneOver(Exception):
 
 @dataclass(frozen=True)
 class Part:
-    """One loop of a retune with its job, as far as there is one."""
+    """One loop of a retune with its latest job, as far as there is one.
+
+    given_up: whether it will have no other job; reason and detail then say why.
+    """
 
     position: int
     loop: str
@@ -63,6 +66,7 @@ class Part:
     job_state: JobState | None
     reason: str | None
     detail: str | None
+    given_up: bool = False
 
     @property
     def active(self) -> bool:
@@ -71,8 +75,10 @@ class Part:
     @property
     def waiting(self) -> bool:
         """A job that the end of the service cut short is made up for."""
+        if self.given_up:
+            return False
         if self.job_state is None:
-            return self.detail is None
+            return True
         return self.job_state is JobState.ABORTED and self.reason == Reason.SERVICE_STOPPED.value
 
     @property
@@ -81,8 +87,8 @@ class Part:
         is locked."""
         if self.reason == _LOCKED:
             return False
-        if self.job_state is None:
-            return self.detail is not None
+        if self.given_up:
+            return True
         if self.job_state is JobState.ABORTED:
             return self.reason not in _NOBODYS_FAULT
         return self.job_state in _FAILURES
@@ -91,7 +97,7 @@ class Part:
         """`waiting`, `skipped`, or the state of its job. is_open: whether the retune may still begin it."""
         if self.waiting and is_open:
             return WAITING
-        return SKIPPED if self.job_state is None else self.job_state.value
+        return SKIPPED if self.given_up or self.job_state is None else self.job_state.value
 
 
 def add(
@@ -138,8 +144,9 @@ def parts(session: Session, retune_id: str) -> list[Part]:
             row.loop,
             row.job_id,
             shown(state, dry) if state else None,
-            reason or row.reason,
-            detail or row.detail,
+            reason if row.detail is None else row.reason,
+            detail if row.detail is None else row.detail,
+            given_up=row.detail is not None,
         )
         for row, state, dry, reason, detail in session.execute(wanted)
     ]
@@ -172,7 +179,7 @@ def begins(retune_id: str, position: int) -> Callable[[Session, JobRow], None]:
 
 
 def give_up(session: Session, retune_id: str, position: int, detail: str, reason: Reason | None = None) -> None:
-    """Notes why a loop will have no job."""
+    """Notes why a loop will have no job, or no other than that which was cut short."""
     _set(session, retune_id, position, detail=detail, reason=None if reason is None else reason.value)
 
 

@@ -382,7 +382,8 @@ class RetuneRow(Base):
 
 
 class RetuneLoopRow(Base):
-    """A loop of such a retune. detail: why it has no job, when it will never have one; reason: from the closed list."""
+    """A loop of such a retune with its latest job. detail: why it will have none, or no other; reason: from the closed
+    list."""
 
     __tablename__ = "retune_loops"
 

@@ -10,6 +10,7 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 from pydantic import ValidationError
+from sqlalchemy.orm import Session
 
 from loopwright.service.api.app import create_app
 from loopwright.service.cli.client import Client
@@ -19,7 +20,7 @@ from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest, fleet_r
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.states.job_state import JobState
-from loopwright.service.store import audit
+from loopwright.service.store import audit, retunes
 from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver
 from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import Aborted, Failed, Reason, Refused
@@ -249,6 +250,60 @@ def test_a_service_stopped_in_between_goes_on_where_it_was(tmp_path: Path) -> No
     jobs = again.store.recent()
     assert len(jobs) == 4 and {(j.request["sp_deviation"], j.requested_by) for j in jobs} == {(1.5, "night")}
     again.close()
+
+
+@pytest.fixture
+def cut_short(tmp_path: Path) -> Iterator[tuple[Plant, str, str]]:
+    """A retune of A-1 and A-2 after a stop of the service in the test of A-1: the next service, the retune, the job."""
+    first = Plant(tmp_path)
+    first.hold()
+    retune = first.fleet.start(asked(loops=["A-1", "A-2"], at_once_per_bus=1)).id
+    first.fleet.poll()
+    assert first.tune.inside.wait(60)
+    (cut,) = first.store.unfinished()
+    first.jobs.stop()  # as SIGTERM does
+    first.close()
+    again = Plant(tmp_path)
+    assert again.parts(retune)["A-1"].waiting
+    yield again, retune, cut.id
+    again.close()
+
+
+def test_a_loop_cut_short_and_locked_before_the_next_start_is_skipped_also_after_the_unlock(
+    cut_short: tuple[Plant, str, str],
+) -> None:
+    plant, retune, cut = cut_short
+    plant.jobs.locking.lock("A-1", "valve is being overhauled", "night shift")
+    for _ in range(3):
+        plant.settle()
+    row, parts = plant.fleet.get(retune)
+    assert (row.state, [part.state(True) for part in parts]) == ("done", ["skipped", "proposed"])
+    part = parts[0]
+    assert (part.job_id, part.reason, part.failed) == (cut, "locked", False) and part.detail is not None
+    assert "night shift" in part.detail and "valve is being overhauled" in part.detail
+    plant.jobs.locking.unlock("A-1", "night shift")
+    plant.fleet.poll()
+    assert plant.running() == [] and len(plant.store.recent()) == 2
+
+
+def test_a_loop_cut_short_and_gone_at_the_next_start_is_said_so_and_counts_as_failed(
+    cut_short: tuple[Plant, str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant, retune, cut = cut_short
+    del plant.loops["A-1"]
+    given_up: list[str] = []
+    give_up = retunes.give_up
+
+    def counted(session: Session, retune_id: str, position: int, detail: str, reason: Reason | None = None) -> None:
+        given_up.append(detail)
+        give_up(session, retune_id, position, detail, reason)
+
+    monkeypatch.setattr(retunes, "give_up", counted)
+    for _ in range(3):
+        plant.settle()
+    part = plant.parts(retune)["A-1"]
+    assert (part.job_id, part.reason, part.detail, part.failed) == (cut, None, "there is no loop A-1", True)
+    assert plant.state(retune) == "done" and given_up == ["there is no loop A-1"]
 
 
 def test_a_service_that_is_not_to_resume_ends_it(tmp_path: Path) -> None:
