@@ -13,7 +13,7 @@ from collections.abc import Collection, Sequence
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, Field, TypeAdapter, model_validator
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_validator
 from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.errors import Locked, RemoteSetpoint, Stopping, UnknownLoop
@@ -29,7 +29,7 @@ from loopwright.service.inputs.request import (
     retune_request,
     within,
 )
-from loopwright.service.inputs.validation import branch
+from loopwright.service.inputs.validation import branch, lines
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.states.job_state import IllegalMove
 from loopwright.service.store import retunes
@@ -223,17 +223,16 @@ class Fleet:
             with self._store.reading() as session:
                 rows = retunes.unfinished(session, self._store.host)
             for row in rows:
-                self._one(*self.get(row.id))
+                try:
+                    self._one(*self.get(row.id))
+                except (FolderInUse, SQLAlchemyError):
+                    raise
+                except Exception:  # the others go on
+                    log.exception("a defect in the retune of many loops %s", row.id)
 
     def _one(self, row: RetuneRow, parts: list[Part]) -> None:
-        request = fleet_request(**row.request | {"loops": [part.loop for part in parts]} | _NO_PATTERN)
-        failures = sum(part.failed for part in parts)
-        if row.stop_reason is None and request.stop_after_failures and failures >= request.stop_after_failures:
-            named = ", ".join(part.loop for part in parts if part.failed)
-            with self._store.writing() as session:
-                retunes.stop(session, row.id, StopReason.FAILURES, f"{failures} ended without a proposal: {named}")
-        elif row.stop_reason is None:
-            self.begin(row, request, parts)
+        if row.stop_reason is None:
+            self._go_on(row, parts)
         elif row.stop_reason == StopReason.OPERATOR:
             self._abort(row, parts)
         row, parts = self.get(row.id)
@@ -241,6 +240,27 @@ class Fleet:
         if not waits and not any(part.active for part in parts):
             with self._store.writing() as session:
                 retunes.end(session, row.id)
+
+    def _go_on(self, row: RetuneRow, parts: list[Part]) -> None:
+        """Starts jobs where possible, unless too many have failed, or this version does not take the request that
+        another has stored."""
+        try:
+            request = fleet_request(**row.request | {"loops": [part.loop for part in parts]} | _NO_PATTERN)
+        except ValidationError as error:
+            left = ", ".join(part.loop for part in parts if part.waiting)
+            why = f"another version of Loopwright has stored the request, which this one does not take: {lines(error)}"
+            self._stop(row, StopReason.SERVICE_STOPPED, f"{why}. Ask anew for the loops not begun: {left or 'none'}")
+            return
+        failures = sum(part.failed for part in parts)
+        if request.stop_after_failures and failures >= request.stop_after_failures:
+            named = ", ".join(part.loop for part in parts if part.failed)
+            self._stop(row, StopReason.FAILURES, f"{failures} ended without a proposal: {named}")
+        else:
+            self.begin(row, request, parts)
+
+    def _stop(self, row: RetuneRow, reason: StopReason, why: str) -> None:
+        with self._store.writing() as session:
+            retunes.stop(session, row.id, reason, why)
 
     def begin(self, row: RetuneRow, request: FleetRequest, parts: Sequence[Part]) -> None:
         """Starts jobs on the waiting loops, in order, as bus and area permit; tests of other requests count too."""

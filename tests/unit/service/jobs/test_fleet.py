@@ -23,6 +23,7 @@ from loopwright.service.states.job_state import JobState
 from loopwright.service.store import audit, retunes
 from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver
 from loopwright.service.store.store import Store
+from loopwright.service.store.tables import RetuneRow
 from loopwright.tuning.reasons import Aborted, Failed, Reason, Refused
 from tests.unit.service.fakes import (
     FakeController,
@@ -304,6 +305,60 @@ def test_a_loop_cut_short_and_gone_at_the_next_start_is_said_so_and_counts_as_fa
     part = plant.parts(retune)["A-1"]
     assert (part.job_id, part.reason, part.detail, part.failed) == (cut, None, "there is no loop A-1", True)
     assert plant.state(retune) == "done" and given_up == ["there is no loop A-1"]
+
+
+def of_another_version(plant: Plant, retune_id: str) -> None:
+    """The stored request has an option that this version does not know."""
+    with plant.store.writing() as session:
+        row = retunes.find(session, retune_id)
+        row.request = {**row.request, "renamed_since": 1}
+
+
+def test_a_stored_request_that_this_version_does_not_take_ends_its_retune_and_no_other(plant: Plant) -> None:
+    old = plant.fleet.start(asked(loops=["A-1", "A-2"], at_once_per_bus=1)).id
+    plant.hold()
+    plant.fleet.poll()
+    assert plant.running() == ["A-1"]
+    of_another_version(plant, old)
+    new = plant.fleet.start(asked(loops=["B-Y1"])).id
+    plant.fleet.poll()
+    assert plant.running() == ["A-1", "B-Y1"] and plant.state(old) == "stopping"
+    plant.settle()
+    row, parts = plant.fleet.get(old)
+    assert (row.state, row.stop_reason, plant.state(new)) == ("stopped", "service_stopped", "done")
+    assert row.detail is not None and "renamed_since: no option of fast" in row.detail
+    assert row.detail.endswith("Ask anew for the loops not begun: A-2")
+    assert [part.state(False) for part in parts] == ["proposed", "skipped"]
+
+
+def test_a_retune_whose_stored_request_this_version_does_not_take_can_be_aborted(plant: Plant) -> None:
+    plant.hold()
+    retune = plant.fleet.start(asked(loops=["A-1", "A-2"], at_once_per_bus=1)).id
+    plant.fleet.poll()
+    of_another_version(plant, retune)
+    plant.fleet.abort(retune, "me")
+    for row in plant.store.unfinished():
+        plant.wait(row.id)
+    plant.fleet.poll()
+    assert plant.state(retune) == "aborted"
+
+
+def test_a_defect_in_one_retune_does_not_hold_up_the_others(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = plant.fleet.start(asked(loops=["A-1"])).id
+    plant.fleet.start(asked(loops=["B-1"]))
+    plant.hold()
+    begin = plant.fleet.begin
+
+    def defective(row: RetuneRow, request: FleetRequest, parts: list[Part]) -> None:
+        if row.id == first:
+            raise KeyError("A-1")
+        begin(row, request, parts)
+
+    monkeypatch.setattr(plant.fleet, "begin", defective)
+    plant.fleet.poll()
+    assert plant.running() == ["B-1"] and f"a defect in the retune of many loops {first}" in caplog.text
 
 
 def test_a_service_that_is_not_to_resume_ends_it(tmp_path: Path) -> None:
