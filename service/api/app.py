@@ -32,6 +32,7 @@ from loopwright.service.api import (
     webhooks,
 )
 from loopwright.service.api import live as live_api
+from loopwright.service.api.aborts import Aborts
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.events import event_stream, still_permitted
 from loopwright.service.api.gate.access_log import Access
@@ -141,7 +142,7 @@ def create_app(
     app.add_middleware(Idempotent, keys=IdempotencyKeys(jobs.store))
     key_checks = None if keyring is None else KeyChecks(keyring, policy.limits)
     gateway = jobs.store.host if jobs.store.shared else None
-    app.add_middleware(Gate, policy=policy, checks=key_checks, gateway=gateway)
+    app.add_middleware(Gate, policy=policy, checks=key_checks, abort_told=Aborts(jobs).told, gateway=gateway)
     app.add_middleware(Head)
     app.add_middleware(Access)
     problems.install(app)

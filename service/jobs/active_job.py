@@ -25,6 +25,7 @@ class Running:
     `stop_reason`.
 
     before_s: plant time of the earlier attempts, s; the time of this attempt is added to it.
+    retune: id of the retune of many loops that has begun the job; None: there is none.
     """
 
     def __init__(
@@ -34,9 +35,11 @@ class Running:
         journal: Journal,
         before_s: float = 0.0,
         monotonic: Callable[[], float] = time.monotonic,
+        retune: str | None = None,
     ) -> None:
         self.job_id = job_id
         self.tag = tag
+        self.retune = retune
         self.progress = Progress(before_s)
         self.loop: ObservedLoop | None = None
         self.stop_reason: Reason | None = None

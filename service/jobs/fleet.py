@@ -10,13 +10,15 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_validator
 from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
 
-from loopwright.service.errors import Locked, RemoteSetpoint, Stopping, UnknownLoop
+from loopwright.service.errors import Locked, NotKnown, RemoteSetpoint, Stopping, UnknownLoop
 from loopwright.service.inputs.config import BusConfig, LoopConfig
 from loopwright.service.inputs.request import (
     AnyRetune,
@@ -30,11 +32,12 @@ from loopwright.service.inputs.request import (
     within,
 )
 from loopwright.service.inputs.validation import branch, lines
+from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.states.job_state import IllegalMove
 from loopwright.service.store import retunes
 from loopwright.service.store.retunes import Part, RetuneOver, StopReason
-from loopwright.service.store.store import Busy, FolderInUse
+from loopwright.service.store.store import Busy, FolderInUse, as_asked, now
 from loopwright.service.store.tables import RetuneRow
 from loopwright.tuning.reasons import Reason
 
@@ -128,6 +131,8 @@ class Fleet:
         self._store = jobs.store
         self._wake = threading.Event()
         self._over = threading.Event()
+        self._aborted: set[str] = set()
+        """Ids of the retunes whose abort the database did not take at once."""
         self._looking = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
 
@@ -197,13 +202,42 @@ class Fleet:
         return [known[tag][0] for tag in tags]
 
     def abort(self, retune_id: str, by: str) -> RetuneRow:
-        """Starts no more jobs, and asks the running jobs to stop. Raises NoSuchRetune, RetuneOver."""
-        with self._store.writing() as session:
-            retunes.stop(session, retune_id, StopReason.OPERATOR, f"aborted by {by}", by)
+        """Starts no more jobs, and asks the running jobs to stop: those that run here before anything is read or
+        stored. While the database does not take the abort of such jobs, the abort waits in the journal. Raises
+        NoSuchRetune, RetuneOver, NotKnown."""
+        told = self._jobs.tell_all_of(retune_id)
+        try:
+            with self._store.writing() as session:
+                retunes.stop(session, retune_id, StopReason.OPERATOR, f"aborted by {by}", by)
+        except SQLAlchemyError as error:
+            if not told or not temporary(error):
+                raise
+            return self._stop_later(retune_id, by, told)
         row, parts = self.get(retune_id)
         self._abort(row, parts)
         self._wake.set()
         return row
+
+    def _stop_later(self, retune_id: str, by: str, told: Sequence[str]) -> RetuneRow:
+        """Stores an abort through the journal. Raises NotKnown. told: the jobs that have heard of it."""
+        at = now()
+
+        def write(session: Session) -> None:
+            with suppress(RetuneOver):  # nothing of it ran any more
+                retunes.stop(session, retune_id, StopReason.OPERATOR, f"aborted by {by}", by, at)
+
+        self._aborted.add(retune_id)
+        self._jobs.journal.put(as_asked(write))
+        for job_id in told:
+            self._jobs.record_stop(job_id, f"retune {retune_id}")
+        try:
+            return self.get(retune_id)[0]
+        except SQLAlchemyError as error:
+            raise NotKnown(
+                f"the {len(told)} tests of retune {retune_id} that run at this gateway have been told to stop, and "
+                "restore their loops; the database does not answer: that no more are begun is stored, and what has "
+                "become of each can be seen, when it is back"
+            ) from error
 
     # queries
     def get(self, retune_id: str) -> tuple[RetuneRow, list[Part]]:
@@ -223,6 +257,8 @@ class Fleet:
             with self._store.reading() as session:
                 rows = retunes.unfinished(session, self._store.host)
             for row in rows:
+                if row.stop_reason is None and row.id in self._aborted:  # its abort waits in the journal
+                    continue
                 try:
                     self._one(*self.get(row.id))
                 except (FolderInUse, SQLAlchemyError):
@@ -302,7 +338,7 @@ class Fleet:
             self._jobs.tell_to_stop(job_id)
         for job_id in active:
             try:
-                self._jobs.abort(job_id, f"retune {row.id}")
+                self._jobs.ask_to_stop(job_id, f"retune {row.id}")
             except IllegalMove:
                 continue  # the job has just ended
 

@@ -223,21 +223,8 @@ class Jobs:
                 self.registry.unqueued.pop(job_id, None)
 
     def abort(self, job_id: str, by: str) -> Job:
-        """Asks an active job to stop; it ends as aborted once the loop is restored. Raises IllegalMove, NotKnown.
-
-        A job that runs here is asked before the abort is stored, so the loop does not wait for the database. While the
-        database does not take the abort of such a job, the abort waits in the journal.
-        """
-        heard = self.tell_to_stop(job_id)
-        try:
-            row = self.store.request_stop(job_id, Reason.OPERATOR, by, heard)
-        except SQLAlchemyError as error:
-            if not heard or not temporary(error):
-                raise
-            self.journal.put(stop_of(job_id, Reason.OPERATOR, by))
-        else:
-            if row.host == self.store.host and not heard:
-                self._request_stop_of(job_id, Reason.OPERATOR)
+        """Asks an active job to stop, as `ask_to_stop` does. Raises IllegalMove, NotKnown."""
+        heard = self.ask_to_stop(job_id, by)
         try:
             return self.store.get(job_id)
         except SQLAlchemyError as error:
@@ -248,14 +235,60 @@ class Jobs:
                 "become of the job can be seen, and who has stopped it is stored, when the database is back"
             ) from error
 
+    def ask_to_stop(self, job_id: str, by: str) -> bool:
+        """Asks an active job to stop; it ends as aborted once the loop is restored. Returns whether a job that runs
+        here has heard. Raises IllegalMove.
+
+        A job that runs here is asked before the abort is stored, so the loop does not wait for the database. While the
+        database does not take the abort of such a job, the abort waits in the journal.
+        """
+        self.tell_to_stop(job_id)
+        heard = self._heard(job_id)
+        try:
+            row = self.store.request_stop(job_id, Reason.OPERATOR, by, heard)
+        except SQLAlchemyError as error:
+            if not heard or not temporary(error):
+                raise
+            self.journal.put(stop_of(job_id, Reason.OPERATOR, by))
+        else:
+            if row.host == self.store.host and not heard:
+                self._request_stop_of(job_id, Reason.OPERATOR)
+        finally:
+            self.registry.unrecorded.discard(job_id)
+        return heard
+
     def tell_to_stop(self, job_id: str) -> bool:
-        """Asks a job that runs here to stop for an operator; returns at once, and stores nothing. Returns False where
-        no such job runs here."""
+        """Asks a job that runs here to stop for an operator; returns at once, and stores nothing: `ask_to_stop`
+        does, or `record_stop` where that does not follow.
+
+        Returns False where no such job runs here, or it was asked before.
+        """
         running = self.registry.running.get(job_id)
-        if running is None:
+        if running is None or running.stop_reason is not None:
             return False
-        running.stop_reason = running.stop_reason or Reason.OPERATOR
-        return running.stop_reason is Reason.OPERATOR
+        self.registry.unrecorded.add(job_id)
+        running.stop_reason = Reason.OPERATOR
+        return True
+
+    def tell_all_of(self, retune_id: str) -> list[str]:
+        """Asks the jobs of a retune of many loops that run here to stop for an operator, as `tell_to_stop` does.
+        Returns those that are being stopped for one."""
+        mine = [job_id for job_id, each in self.registry.running.copy().items() if each.retune == retune_id]
+        for job_id in mine:
+            self.tell_to_stop(job_id)
+        return [job_id for job_id in mine if self._heard(job_id)]
+
+    def record_stop(self, job_id: str, by: str) -> None:
+        """Hands to the journal who has told a job to stop, where nobody has noted that; returns at once."""
+        if job_id in self.registry.unrecorded:
+            self.journal.put(stop_of(job_id, Reason.OPERATOR, by))
+            self.registry.unrecorded.discard(job_id)
+
+    def _heard(self, job_id: str) -> bool:
+        """Returns whether a job that runs here, or did a moment ago, was told to stop for an operator."""
+        running = self.registry.running.get(job_id)
+        stopped_for_one = running is not None and running.stop_reason is Reason.OPERATOR
+        return stopped_for_one or job_id in self.registry.unrecorded
 
     def _request_stop_of(
         self,

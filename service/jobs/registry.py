@@ -21,6 +21,8 @@ class Registry:
         self.running: dict[str, Running] = {}
         # By id: jobs that could not be stored or queued, as the caller was told, and whose end is not stored yet.
         self.unqueued: dict[str, Job] = {}
+        # By id: jobs that an operator has told to stop, where it is neither stored nor in the journal who that was.
+        self.unrecorded: set[str] = set()
         # Guards the registry of running jobs and `stopping`.
         self.lock = threading.Lock()
 

@@ -97,6 +97,7 @@ class Worker:
         try:
             row = self._lasting(lambda: self.store.get(job_id))
             before_s = self._lasting(lambda: self.store.last_sample_s(job_id)) if row.attempt else 0.0
+            retune = self._lasting(lambda: self.store.retune_of(job_id))
         except NoSuchJob:
             log.error(
                 "job %s was begun and is not in the database: it is lost, the database is older than the engine's file "
@@ -105,7 +106,7 @@ class Worker:
             )
             return
         before_s = max(row.plant_time_s, before_s)
-        running = Running(job_id, row.loop, self.journal, before_s, self._machine.monotonic)
+        running = Running(job_id, row.loop, self.journal, before_s, self._machine.monotonic, retune)
         if not self._registry.enter(running):
             return
         try:

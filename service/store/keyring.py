@@ -21,6 +21,10 @@ REVOKED_WITHIN_S = 2.0
 """How long a key that was just used may still be taken for valid after it was revoked."""
 
 
+ABORTS_FOR_S = 12 * 3600.0
+"""How long after it was last found valid a key may abort tests while the database does not answer: a shift."""
+
+
 class KeyProblem(Exception):
     """The wish about a key cannot be met; the text says why."""
 
@@ -97,11 +101,25 @@ class Keyring:
         seen = self._right.get(key_id_of(key) or "")
         return seen if seen is not None and hmac.compare_digest(seen.digest, _digest(key)) else None
 
+    def last_valid(self, key_id: str) -> KeyRow | None:
+        """The row of a key that was right, as the database had it last: for an abort while the database is away. None
+        where that is longer ago than ABORTS_FOR_S, or the key has expired since."""
+        right = self._right.get(key_id)
+        if right is None or self._wall() - right.at > ABORTS_FOR_S or not valid(right.row):
+            return None
+        return right.row
+
     def still_valid(self, key_id: str) -> bool:
         """Whether a key that was checked before is valid now: for an answer that lasts. One query."""
         with self._session() as session:
             row = session.get(KeyRow, key_id)
-        return row is not None and valid(row)
+        if row is None or not valid(row):
+            self._right.pop(key_id, None)
+            return False
+        right = self._right.get(key_id)
+        if right is not None and right.row.hash == row.hash:
+            self._right[key_id] = _Right(right.digest, self._wall(), row)
+        return True
 
     def name_of(self, key_id: str) -> str | None:
         """The name of the key with this id, also of one that is not valid; None: there is none. One query."""

@@ -152,6 +152,11 @@ def parts(session: Session, retune_id: str) -> list[Part]:
     ]
 
 
+def of_job(session: Session, job_id: str) -> str | None:
+    """Id of the retune that has begun the job; None: there is none."""
+    return session.scalar(select(RetuneLoopRow.retune_id).where(RetuneLoopRow.job_id == job_id).limit(1))
+
+
 def unfinished(session: Session, host: str) -> list[RetuneRow]:
     """Those that the host has to drive, the oldest first."""
     mine = (RetuneRow.host == host, RetuneRow.ended_at.is_(None))
@@ -183,8 +188,12 @@ def give_up(session: Session, retune_id: str, position: int, detail: str, reason
     _set(session, retune_id, position, detail=detail, reason=None if reason is None else reason.value)
 
 
-def stop(session: Session, retune_id: str, reason: StopReason, detail: str, by: str | None = None) -> bool:
-    """From now on it begins no more jobs. False when that was so already. by: whose wish it was, for the audit log.
+def stop(
+    session: Session, retune_id: str, reason: StopReason, detail: str, by: str | None = None, at: str | None = None
+) -> bool:
+    """From now on it begins no more jobs. False when that was so already.
+
+    by: whose wish it was, for the audit log; at: when it was said, None for now.
 
     Raises NoSuchRetune, and RetuneOver when it has ended.
     """
@@ -199,7 +208,7 @@ def stop(session: Session, retune_id: str, reason: StopReason, detail: str, by: 
         return False
     row.state, row.stop_reason, row.detail = RetuneState.STOPPING.value, reason.value, detail
     if by is not None:
-        audit.record(session, "retune_many_abort", retune_id, after={"reason": reason.value}, said_by=by)
+        audit.record(session, "retune_many_abort", retune_id, after={"reason": reason.value}, said_by=by, at=at)
     return True
 
 

@@ -331,6 +331,11 @@ class Store:
         with self._session() as session:
             return Job.from_row(_find(session, job_id))
 
+    def retune_of(self, job_id: str) -> str | None:
+        """Id of the retune of many loops that has begun the job; None: there is none."""
+        with self._session() as session:
+            return retunes.of_job(session, job_id)
+
     def active(self, loop: str) -> Job | None:
         """The job that has the loop, if any."""
         wanted = select(JobRow).where(JobRow.loop == loop, JobRow.state.in_(_ACTIVE), JobRow.dry_run.is_(False))

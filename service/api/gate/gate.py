@@ -8,6 +8,8 @@ from __future__ import annotations
 import ipaddress
 import logging
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 
 from sqlalchemy.exc import SQLAlchemyError
@@ -31,6 +33,7 @@ from loopwright.service.api.gate.places import (
     changes_nothing,
     is_page,
     kind_of,
+    stops_a_test,
 )
 from loopwright.service.loops.shared_reading import asked_at
 from loopwright.service.security.keys import Scope
@@ -78,13 +81,23 @@ class Gate:
     """Wraps the application.
 
     The gate checks the key, then the rate of its holder, then receives the body, then takes a place among the requests
-    of the same kind. A body that does not arrive therefore takes nobody's place.
+    of the same kind. A body that does not arrive therefore takes nobody's place. A test hears of an abort before the
+    body and the place are waited for.
 
+    abort_told: tells the tests of the path of an abort, and lasts until that is answered.
     gateway: name of this gateway, where several share a database.
     """
 
-    def __init__(self, app: ASGIApp, policy: Policy, checks: KeyChecks | None, gateway: str | None = None) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        policy: Policy,
+        checks: KeyChecks | None,
+        abort_told: Callable[[str], AbstractContextManager[None]],
+        gateway: str | None = None,
+    ) -> None:
         self._app = app
+        self._abort_told = abort_told
         self._gateway = gateway
         self._policy = policy
         limits = policy.limits
@@ -118,16 +131,20 @@ class Gate:
         urgent.set(kind in DECIDES)
         try:
             self._refuse_often(kind, client)
-            self._places.check(kind, client)
-            body = await self._bodies.whole(scope, receive, client, small=kind in _SMALL)
-            if body is not None:
-                receive = begins_with(body, receive)
-            async with self._places.taken(kind, client) as turn:
-                await self._app(scope, receive, _until_it_begins(send, turn))
+            with self._abort_told(scope["path"]) if stops_a_test(scope["method"], scope["path"]) else nullcontext():
+                await self._in_turn(scope, receive, send, kind, client)
         except (Full, BodyRefused) as refused:
             await _refusal(refused.status, str(refused), 1.0)(scope, receive, send)
         except TooOften as refused:
             await _refusal(429, str(refused), refused.wait_s)(scope, receive, send)
+
+    async def _in_turn(self, scope: AsgiScope, receive: Receive, send: Send, kind: RequestKind, client: str) -> None:
+        self._places.check(kind, client)
+        body = await self._bodies.whole(scope, receive, client, small=kind in _SMALL)
+        if body is not None:
+            receive = begins_with(body, receive)
+        async with self._places.taken(kind, client) as turn:
+            await self._app(scope, receive, _until_it_begins(send, turn))
 
     def _refuse_often(self, kind: RequestKind, client: str) -> None:
         if kind is RequestKind.WATCH:
@@ -154,7 +171,8 @@ class Gate:
         if kind.lower() != "bearer" or not key:
             return _unauthorized("this needs an API key: Authorization: Bearer KEY")
         try:
-            row = await self._checks.row(key, anyone.address or "unknown")
+            stops = stops_a_test(scope["method"], scope["path"])
+            row = await self._checks.row(key, anyone.address or "unknown", stops)
         except TooOften as often:
             return _refusal(429, str(often), often.wait_s)
         except SQLAlchemyError:
@@ -175,12 +193,13 @@ class Gate:
         session = sessions.of(token)
         if session is not None and sessions.unchecked_s(session) > REVOKED_WITHIN_S:
             assert self._checks is not None
+            stops = stops_a_test(scope["method"], scope["path"])
             try:
-                if await self._checks.still_valid(session.key_id):
-                    sessions.checked(session)
-                else:
+                if not await self._checks.still_valid(session.key_id, stops):
                     sessions.end_of_key(session.key_id)
                     session = None
+                elif not stops:  # an abort may have been let in without the database
+                    sessions.checked(session)
             except SQLAlchemyError:
                 log.exception("the keys cannot be read")
                 return _refusal(503, _KEYS_AWAY, 5.0)

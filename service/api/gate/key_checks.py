@@ -8,9 +8,10 @@ waits behind one guess of each other address, not behind all guesses.
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from typing import TypeVar
@@ -23,6 +24,10 @@ from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.tables import KeyRow
 
 T = TypeVar("T")
+log = logging.getLogger(__name__)
+
+_ABORT_WAITS_S = 1.0
+"""Wall time for which an abort waits for the look at a key that was valid before."""
 
 
 class TooOften(Exception):
@@ -45,20 +50,22 @@ class KeyChecks:
         self._hashing = ThreadPoolExecutor(1, "key hash")
         self._looking = ThreadPoolExecutor(2, "key")
 
-    async def row(self, key: str, address: str) -> KeyRow | None:
+    async def row(self, key: str, address: str, stops_a_test: bool = False) -> KeyRow | None:
         """The row of a valid key, None for a wrong key. Raises TooOften, SQLAlchemyError."""
         found = self._keyring.known(key)
         if found is not None:
             return found
         if self._keyring.was_right(key):
-            return await self._in(self._looking, key)
+            last = self._keyring.last_valid(key_id_of(key) or "") if stops_a_test else None
+            return await _unless_away(self._in(self._looking, key), last)
         self._refuse_early(address)
         async with self._turn(address):
             return self._keyring.known(key) or await self._guess(key, address)
 
-    async def still_valid(self, key_id: str) -> bool:
+    async def still_valid(self, key_id: str, stops_a_test: bool = False) -> bool:
         """Whether a key that was checked before is valid now. Raises SQLAlchemyError."""
-        return await self._look(lambda: self._keyring.still_valid(key_id))
+        last = stops_a_test and self._keyring.last_valid(key_id) is not None
+        return await _unless_away(self._look(lambda: self._keyring.still_valid(key_id)), last or None)
 
     async def name_of(self, key: str) -> str | None:
         """The name of the key that has the id of this one; None: there is none. Raises SQLAlchemyError."""
@@ -106,3 +113,14 @@ class KeyChecks:
 
     async def _in(self, threads: ThreadPoolExecutor, key: str) -> KeyRow | None:
         return await asyncio.get_running_loop().run_in_executor(threads, self._keyring.check, key)
+
+
+async def _unless_away(looked_up: Awaitable[T], last: T | None) -> T:
+    """What the database says of a key. last: what it said last, where that is enough while it does not answer."""
+    if last is None:
+        return await looked_up
+    try:
+        return await asyncio.wait_for(looked_up, _ABORT_WAITS_S)
+    except (TimeoutError, SQLAlchemyError) as error:
+        log.warning("the keys cannot be read, an abort is let in by a key that was valid: %s", error or "no answer yet")
+        return last

@@ -18,6 +18,7 @@ from enum import StrEnum
 from loopwright.service.api.gate.limits import RequestLimits
 
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
+_ABORT = re.compile(r"/(?:jobs|retunes)/[^/]+/abort")
 _PREVIEW = re.compile(r"/loops/[^/]+/retune/preview|/retunes/preview")
 
 
@@ -49,6 +50,11 @@ _WATCHED = ("/readyz", "/metrics")
 def changes_nothing(path: str) -> bool:
     """Whether a POST to this path changes nothing."""
     return path == "/tunings" or _PREVIEW.fullmatch(path) is not None
+
+
+def stops_a_test(method: str, path: str) -> bool:
+    """Whether the request is the abort of a job or of a retune of many loops."""
+    return method == "POST" and _ABORT.fullmatch(path) is not None
 
 
 def is_page(path: str) -> bool:

@@ -10,6 +10,7 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 from pydantic import ValidationError
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from loopwright.service.api.app import create_app
@@ -22,7 +23,7 @@ from loopwright.service.server.assembly import make_jobs
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store import audit, retunes
 from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver
-from loopwright.service.store.store import Store
+from loopwright.service.store.store import Store, Write
 from loopwright.service.store.tables import RetuneRow
 from loopwright.tuning.reasons import Aborted, Failed, Reason, Refused
 from tests.unit.service.fakes import (
@@ -35,6 +36,7 @@ from tests.unit.service.fakes import (
     loop_entry,
 )
 from tests.unit.service.postgres import Server
+from tests.unit.service.processes import PATIENCE_S, until
 
 ENTRIES = [
     loop_entry(tag=f"{area}-{n}", area=area or None, bus=f"virtual:{bus}", channel=n + 1, controller_node=node)
@@ -553,3 +555,86 @@ def test_the_command_line_gets_the_whole_list(monkeypatch: pytest.MonkeyPatch) -
 def test_unknown(plant: Plant) -> None:
     with pytest.raises(NoSuchRetune):
         plant.fleet.get("none")
+
+
+def away(*_: Any) -> Any:
+    raise OperationalError("BEGIN IMMEDIATE", {}, Exception("database is locked"))
+
+
+def reasons(plant: Plant) -> list[Reason | None]:
+    return [running.stop_reason for running in plant.jobs.registry.running.copy().values()]
+
+
+def test_an_abort_that_the_database_does_not_take_is_heard_at_once_and_kept(
+    plant: Plant, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant.hold()
+    plant.jobs.start("B-Y1", FastRetune())  # of nobody's retune: it goes on
+    retune = plant.fleet.start(asked(pattern="A-*", at_once_per_bus=2)).id
+    plant.fleet.poll()
+    until(lambda: len(plant.jobs.registry.running) == 3)
+    with monkeypatch.context() as patch:
+        patch.setattr(plant.store, "writing", away)
+        assert client.post(f"/retunes/{retune}/abort", json={"by": "operator A"}).status_code == 202
+        assert client.post(f"/retunes/{retune}/abort", json={"by": "operator A"}).status_code == 202
+        assert sorted(map(str, reasons(plant))) == ["None", "operator", "operator"]
+    assert plant.jobs.journal.flush(PATIENCE_S)
+    until(lambda: plant.running() == ["B-Y1"])
+    until(lambda: plant.state(retune) == "aborted")
+    parts = plant.parts(retune)
+    assert [parts[f"A-{n}"].job_state for n in (1, 2, 3)] == [JobState.ABORTED, JobState.ABORTED, None]
+    trail = [(row.what, row.said_by) for row in audit.trail(plant.store.engine, 100) if "abort" in row.what]
+    assert sorted(trail) == [("abort", f"retune {retune}")] * 2 + [("retune_many_abort", "operator A")]
+
+
+def test_no_more_loops_are_begun_while_an_abort_waits_for_the_database(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant.hold()
+    retune = plant.fleet.start(asked(pattern="A-*", at_once_per_bus=1)).id
+    plant.fleet.poll()
+    until(lambda: len(plant.jobs.registry.running) == 1)
+    waiting: list[Write] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(plant.jobs.journal, "put", waiting.append)
+        with monkeypatch.context() as inner:
+            inner.setattr(plant.store, "writing", away)
+            plant.fleet.abort(retune, "me")
+        until(lambda: not plant.running())
+        plant.fleet.poll()
+        assert plant.running() == [] and plant.state(retune) == "running"
+    for write in waiting:
+        plant.jobs.journal.put(write)
+    assert plant.jobs.journal.flush(PATIENCE_S)
+    plant.fleet.poll()
+    assert plant.state(retune) == "aborted"
+
+
+def test_an_abort_while_the_database_answers_nothing_says_that_the_tests_have_heard(
+    plant: Plant, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant.hold()
+    retune = plant.fleet.start(asked(loops=["A-1", "A-2"])).id
+    plant.fleet.poll()
+    until(lambda: len(plant.jobs.registry.running) == 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(plant.store, "writing", away)
+        patch.setattr(plant.store, "reading", away)
+        answer = client.post(f"/retunes/{retune}/abort")
+        assert answer.status_code == 503 and "the 2 tests of retune" in answer.json()["detail"]
+        assert reasons(plant) == [Reason.OPERATOR] * 2
+    assert plant.jobs.journal.flush(PATIENCE_S)
+    until(lambda: plant.state(retune) == "aborted")
+
+
+def test_an_abort_of_a_retune_of_which_nothing_runs_is_refused_where_the_database_does_not_take_it(
+    plant: Plant, client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant.hold()
+    plant.jobs.start("A-1", FastRetune())
+    retune = plant.fleet.start(asked(loops=["A-1"])).id
+    with monkeypatch.context() as patch:
+        patch.setattr(plant.store, "writing", away)
+        assert client.post(f"/retunes/{retune}/abort").status_code == 503
+    assert reasons(plant) == [None]
+    assert client.post(f"/retunes/{retune}/abort").status_code == 202
