@@ -22,7 +22,8 @@ from loopwright.tuning.reasons import Reason, Refused
 REAL, REAL_AT_MOST = 0.01, 0.2
 """A pole p with |Im p|/|p| up to the first is real: the computed roots of a multiple pole form a ring around it. The
 ring of n equal lags is wider, in proportion to eps^(1/n), so the bound grows from order 7 on, to the second at order
-12. The zeta above which a pair is taken for real lags is 0.99995 up to order 6, 0.999 at order 8 and 0.98 from order 12 on.
+12. The zeta above which a pair is taken for real lags is 0.99995 up to order 6, 0.999 at order 8 and 0.98 from order 12
+on.
 """
 
 
