@@ -93,7 +93,7 @@ def _parts(model: Model) -> tuple[float, bool, list[float], float]:
 
 def _real(order: int) -> float:
     """The |Im p|/|p| up to which a pole of a plant of this order is real."""
-    return min(max(REAL, 4.0 * float(np.finfo(float).eps) ** (1.0 / order)), REAL_AT_MOST)
+    return min(max(REAL, 4.0 * math.pow(np.finfo(float).eps, 1.0 / order)), REAL_AT_MOST)
 
 
 def _lags(poles: Complexes) -> list[float]:
