@@ -115,9 +115,13 @@ class Jobs:
     def boot(self) -> None:
         """Registers this host's loops, restores those of its active jobs, then lets the engine continue the jobs.
 
+        Where jobs are not resumed, the database may come from a back-up, older than the last decisions.
+
         Raises ForeignLoop.
         """
         self.store.own_loops({tag: config.model_dump(mode="json") for tag, config in self.directory.loops.items()})
+        if not self.resumes:
+            self.store.doubt_proposals("the service was started with --no-resume")
         self._machine.side_by_side(self._recovery.recover, self.store.unfinished(), _AT_BOOT)
         if self.stopping:  # asked to end meanwhile: the remaining jobs are left to the next start
             return

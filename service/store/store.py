@@ -54,7 +54,7 @@ DECISIONS = {JobState.ACCEPTED: "accept", JobState.ROLLED_BACK: "rollback"}
 """What the audit log calls the moves that somebody decides."""
 _BEGUN = "decision_begun"
 """The event that a decision writes before it writes to the controller: only without it is a proposal known to have
-left the old gains in effect."""
+left the old gains in effect. Its decision is `unknown` where the database may be older than the last decision."""
 _CUT_SHORT = (JobState.ABORTED, JobState.FAILED)
 """Ends of a job that was told to stop; `failed` where its loop could not be restored."""
 _BLOCKS_AT_ONCE = 16
@@ -308,6 +308,12 @@ class Store:
             loop_locks.check(session, row.loop)
             append(session, job_id, _BEGUN, {"decision": DECISIONS[wanted], "by": by}, row.plant_time_s)
 
+    def doubt_proposals(self, why: str) -> None:
+        """Notes of the proposals of every host that a decision may have been made about them which is not in this
+        database: a rollback then reads the controller, and puts the old gains back where it holds the new ones."""
+        with self.writing() as session:
+            _doubt_proposals(session, why)
+
     def resumed(self, job_id: str, details: Mapping[str, object], **columns: Unpack[JobColumns]) -> None:
         """Notes that an active job has begun another attempt. Raises IllegalMove when it is over, Locked."""
         with self.writing() as session:
@@ -458,12 +464,14 @@ class Store:
         return found
 
     def restored(self, source: str) -> int:
-        """Ends what was active when a back-up was made: its experiment is long over. Returns how many jobs."""
+        """Ends what was active when a back-up was made: its experiment is long over. What was a proposal then may have
+        been accepted since. Returns how many jobs were active."""
         active = self.unfinished()
         for row in active:
             detail = f"was {row.state} when the back-up was made that has now been restored"
             self.move(row.id, JobState.INTERRUPTED, reason=Reason.SERVICE_STOPPED.value, detail=detail)
         with self.writing() as session:
+            _doubt_proposals(session, f"the back-up {source} was restored")
             for retune in retunes.unfinished(session, self.host):
                 detail = f"was {retune.state} when the back-up was made that has now been restored"
                 retunes.stop(session, retune.id, retunes.StopReason.SERVICE_STOPPED, detail)
@@ -662,6 +670,13 @@ def _last_begun(session: Session, job_id: str) -> str | None:
     mine = (EventRow.job_id == job_id, EventRow.kind == _BEGUN)
     event = session.scalars(select(EventRow).where(*mine).order_by(EventRow.seq.desc()).limit(1)).one_or_none()
     return None if event is None else str(event.data["decision"])
+
+
+def _doubt_proposals(session: Session, why: str) -> None:
+    begun = select(EventRow.seq).where(EventRow.job_id == JobRow.id, EventRow.kind == _BEGUN).exists()
+    proposals = (JobRow.state == JobState.PROPOSED, JobRow.dry_run.is_(False), ~begun)
+    for row in session.scalars(select(JobRow).where(*proposals).order_by(JobRow.number).with_for_update()).all():
+        append(session, row.id, _BEGUN, {"decision": "unknown", "by": "service", "detail": why}, row.plant_time_s)
 
 
 def _audit_decision(

@@ -99,6 +99,16 @@ def test_a_proposal_is_declined_at_any_gateway_which_writes_nothing(fleet: TwoGa
     assert fleet.here.requests() == [] and writes == []
 
 
+def test_a_proposal_of_a_restored_database_is_taken_back_by_the_gateway_of_its_loop(
+    fleet: TwoGateways, writes: list[Gains]
+) -> None:
+    job = fleet.there.proposed()
+    fleet.there.controller.by_hand(gains=NEW)  # accepted after the dump
+    fleet.here.store.doubt_proposals("the service was started with --no-resume")
+    assert fleet.here.decide(job, "rollback").json()["state"] == "rolled_back"
+    assert fleet.there.controller.state.gains == OLD and writes == [OLD]
+
+
 def test_what_the_gateway_refuses_is_answered_as_it_is_there(fleet: TwoGateways, writes: list[Gains]) -> None:
     job = fleet.there.proposed()
     fleet.there.controller.absent = Reason.NODE_LOST

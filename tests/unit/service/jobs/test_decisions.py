@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,6 +16,8 @@ from loopwright.service.inputs.request import FastRetune
 from loopwright.service.states.job_state import IllegalMove, JobState
 from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store import audit
+from loopwright.service.store.backup import back_up, restore
+from loopwright.service.store.database import FILE
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.fakes import NEW, OLD, TAG, FakeLoop, Service
@@ -183,6 +186,72 @@ def test_a_conflict_begins_nothing(service: Service) -> None:
         service.jobs.decisions.accept(job_id, "me")
     assert begun(service, job_id) == []
     assert service.jobs.decisions.rollback(job_id, "me").state == "rolled_back" and holds(service, BY_HAND)
+
+
+@pytest.fixture(params=["back-up restored", "started with --no-resume"])
+def gone_back(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[tuple[Service, str]]:
+    """A proposal that was accepted after the back-up was made from which the database comes: the controller has the
+    proposed gains. The second way is that after pg_restore, or after a snapshot of the machine."""
+    first = Service(tmp_path / "data")
+    job_id = proposed(first)
+    back_up(tmp_path / "data", tmp_path / "b.sqlite")
+    first.jobs.decisions.accept(job_id, "me")
+    first.close()
+    if request.param == "back-up restored":
+        restore(tmp_path / "b.sqlite", tmp_path / "data", replace=True)
+        again = Service(tmp_path / "data")
+    else:
+        (tmp_path / "snapshot").mkdir()
+        (tmp_path / "b.sqlite").rename(tmp_path / "snapshot" / FILE)
+        again = Service(tmp_path / "snapshot", resume=False)
+    again.controller.state = first.controller.state
+    assert (again.store.get(job_id).state, again.controller.state.gains) == ("proposed", NEW)
+    yield again, job_id
+    again.close()
+
+
+def test_a_proposal_of_a_restored_back_up_is_taken_back_on_the_controller(gone_back: tuple[Service, str]) -> None:
+    service, job_id = gone_back
+    row = service.jobs.decisions.rollback(job_id, "me")
+    assert row.state == "rolled_back" and holds(service, OLD)
+    assert row.restored is not None and row.restored["gains"]["Kp"] == OLD.Kp
+    last = audit.trail(service.store.engine, 1)[0]
+    assert last.before is not None and last.after is not None
+    assert (last.before["gains"]["Kp"], last.after["gains"]["Kp"]) == (NEW.Kp, OLD.Kp)
+
+
+def test_a_proposal_of_a_restored_back_up_can_be_accepted_again(gone_back: tuple[Service, str]) -> None:
+    service, job_id = gone_back
+    assert service.jobs.decisions.accept(job_id, "me").state == "accepted" and holds(service, NEW)
+
+
+def test_a_proposal_of_a_restored_back_up_is_not_said_to_have_its_old_gains_unread(
+    gone_back: tuple[Service, str],
+) -> None:
+    service, job_id = gone_back
+    service.controller.absent = Reason.NODE_LOST
+    with pytest.raises(Failed):
+        service.jobs.decisions.rollback(job_id, "me")
+    assert service.store.get(job_id).state == "proposed"
+
+
+def test_other_gains_are_said_where_a_proposal_of_a_restored_back_up_is_declined(
+    gone_back: tuple[Service, str],
+) -> None:
+    service, job_id = gone_back
+    service.controller.by_hand(gains=BY_HAND)
+    row = service.jobs.decisions.rollback(job_id, "me")
+    assert row.state == "rolled_back" and holds(service, BY_HAND)
+    assert row.detail is not None and "set by others, left as they are" in row.detail
+
+
+def test_where_the_controller_has_the_old_gains_a_proposal_of_a_restored_back_up_is_declined_without_writing(
+    gone_back: tuple[Service, str],
+) -> None:
+    service, job_id = gone_back
+    service.controller.by_hand(gains=OLD)
+    row = service.jobs.decisions.rollback(job_id, "me")
+    assert row.state == "rolled_back" and holds(service, OLD) and begun(service, job_id) == ["unknown"]
 
 
 def test_what_another_host_has_declined_meanwhile_is_not_written(service: Service, monkeypatch: Patch) -> None:
