@@ -12,6 +12,7 @@ The rule is for real poles. Zeros in the left half-plane are refused here: which
 from __future__ import annotations
 
 import math
+import sys
 from typing import Literal
 
 import numpy as np
@@ -19,12 +20,10 @@ import numpy as np
 from loopwright.tuning.models import FOPDT, SOPDT, Complexes, Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 
-REAL, REAL_AT_MOST = 0.01, 0.2
+REAL, REAL_MAX = 0.01, 0.2
 """A pole p with |Im p|/|p| up to the first is real: the computed roots of a multiple pole form a ring around it. The
-ring of n equal lags is wider, in proportion to eps^(1/n), so the bound grows from order 7 on, to the second at order
-12. The zeta above which a pair is taken for real lags is 0.99995 up to order 6, 0.999 at order 8 and 0.98 from order 12
-on.
-"""
+ring of n equal lags is as wide as eps^(1/n), so the bound grows from order 7 on, to the second at order 12. The zeta
+above which a pair is taken for real lags is 0.99995 up to order 6, 0.999 at order 8 and 0.98 from order 12 on."""
 
 
 def half_rule(model: Model, order: Literal[1, 2] = 1) -> FOPDT | SOPDT | Integrating:
@@ -93,7 +92,7 @@ def _parts(model: Model) -> tuple[float, bool, list[float], float]:
 
 def _real(order: int) -> float:
     """The |Im p|/|p| up to which a pole of a plant of this order is real."""
-    return min(max(REAL, 4.0 * math.pow(np.finfo(float).eps, 1.0 / order)), REAL_AT_MOST)
+    return min(max(REAL, 4.0 * math.pow(sys.float_info.epsilon, 1.0 / order)), REAL_MAX)
 
 
 def _lags(poles: Complexes) -> list[float]:
