@@ -632,6 +632,7 @@ def test_an_abort_of_a_retune_of_which_nothing_runs_is_refused_where_the_databas
 ) -> None:
     plant.hold()
     plant.jobs.start("A-1", FastRetune())
+    until(lambda: len(plant.jobs.registry.running) == 1)
     retune = plant.fleet.start(asked(loops=["A-1"])).id
     with monkeypatch.context() as patch:
         patch.setattr(plant.store, "writing", away)
