@@ -201,10 +201,12 @@ def test_a_locked_database_delays_nothing_but_the_answers(stack: ExitStack, tmp_
         gateway.go()
         until(lambda: read_loop(tmp_path, TAG) == HOME)  # the job runs to its end while nothing can be written
         began = time.monotonic()
-        answer = gateway.http.post(f"{url}/abort")
+        answer = gateway.http.post(f"/loops/{TAG}/lock", json={"reason": "valve out"})
         assert (answer.status_code, answer.headers["retry-after"]) == (503, "5")
         # At most one wait for another writer of the process, and one for the file; the rest is for a busy machine.
         assert WAIT_S <= time.monotonic() - began < 2 * WAIT_S + 30
+        # The job has not ended as far as anybody is told, and hears of an abort; its test is over.
+        assert gateway.http.post(f"{url}/abort").status_code == 202
         other.execute("ROLLBACK")
     job = gateway.over(url)
     assert (job["state"], job["attempts"]) == ("proposed", 1)
