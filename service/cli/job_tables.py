@@ -48,7 +48,8 @@ def follow(client: Client, job_url: str, to: Console | None = None) -> JobView:
                 case StateEvent(state=state):
                     bars.update(task, description=state, left="")
         job = JobView.model_validate(client.awaited(job_url))
-        bars.update(task, completed=job.progress)
+        # how far a job is may be told once more after its end
+        bars.update(task, completed=job.progress, description=job.state, left="")
     return job
 
 

@@ -347,6 +347,15 @@ def test_what_users_write_is_shown_as_they_wrote_it(service: Service, through: T
     assert run("loops").exit_code == 0
 
 
+def test_what_is_told_of_a_stage_after_the_end_of_a_job_does_not_hide_the_end(
+    proposed: str, through: Through, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    late = {"stage": "redesign", "progress": 1.0, "remaining_plant_time_s": 0.0, "plant_time_s": 8.0}
+    monkeypatch.setattr(through, "events", lambda _: iter([("state", {"state": "proposed"}), ("progress", late)]))
+    told = run("job", proposed, "--follow").stderr
+    assert "proposed" in told and "redesign" not in told
+
+
 class TestFollowing:
     """A command that ends before what it follows says how it is followed further, and ended."""
 
