@@ -26,7 +26,7 @@ _BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _FILE = re.compile(r"# ([\w.-]+\.\w+)\n")
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _ERROR = re.compile(r"±[\d.e+-]+|below (?=0\.001)")
-_STEP = r"(?<=overshoot )[\d.]+ %, settled in [\d.]+ (?:s|min)"
+_STEP = r"(?<=overshoot )[\d.]+\s%, settled in [\d.]+\s(?:s|min)"  # the blank before a unit may be a narrow one
 _NOISY = re.compile(rf"{_STEP}|(?<=measured )(?:IAE|overshoot|settling)[^\n]*")
 _ID = re.compile(r"\b(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{12}\b")
 _SAME = (
