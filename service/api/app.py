@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
+from functools import partial
 from importlib.metadata import version
 from typing import Annotated, Literal
 
@@ -32,7 +33,7 @@ from loopwright.service.api import (
     webhooks,
 )
 from loopwright.service.api import live as live_api
-from loopwright.service.api.aborts import Aborts
+from loopwright.service.api.aborts import stopping
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.events import event_stream, still_permitted
 from loopwright.service.api.gate.access_log import Access
@@ -142,7 +143,7 @@ def create_app(
     app.add_middleware(Idempotent, keys=IdempotencyKeys(jobs.store))
     key_checks = None if keyring is None else KeyChecks(keyring, policy.limits)
     gateway = jobs.store.host if jobs.store.shared else None
-    app.add_middleware(Gate, policy=policy, checks=key_checks, abort_told=Aborts(jobs).told, gateway=gateway)
+    app.add_middleware(Gate, policy=policy, checks=key_checks, stopping=partial(stopping, jobs), gateway=gateway)
     app.add_middleware(Head)
     app.add_middleware(Access)
     problems.install(app)

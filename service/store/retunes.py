@@ -193,7 +193,7 @@ def stop(
 ) -> bool:
     """From now on it begins no more jobs. False when that was so already.
 
-    by: whose wish it was, for the audit log; at: when it was said, None for now.
+    by: who asked for it, for the audit log; at: when, None for now.
 
     Raises NoSuchRetune, and RetuneOver when it has ended.
     """

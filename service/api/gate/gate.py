@@ -84,7 +84,7 @@ class Gate:
     of the same kind. A body that does not arrive therefore takes nobody's place. A test hears of an abort before the
     body and the place are waited for.
 
-    abort_told: tells the tests of the path of an abort, and lasts until that is answered.
+    stopping: asks the tests of the path of an abort to stop, and lasts until that is answered.
     gateway: name of this gateway, where several share a database.
     """
 
@@ -93,11 +93,11 @@ class Gate:
         app: ASGIApp,
         policy: Policy,
         checks: KeyChecks | None,
-        abort_told: Callable[[str], AbstractContextManager[None]],
+        stopping: Callable[[str], AbstractContextManager[None]],
         gateway: str | None = None,
     ) -> None:
         self._app = app
-        self._abort_told = abort_told
+        self._stopping = stopping
         self._gateway = gateway
         self._policy = policy
         limits = policy.limits
@@ -131,7 +131,7 @@ class Gate:
         urgent.set(kind in DECIDES)
         try:
             self._refuse_often(kind, client)
-            with self._abort_told(scope["path"]) if stops_a_test(scope["method"], scope["path"]) else nullcontext():
+            with self._stopping(scope["path"]) if stops_a_test(scope["method"], scope["path"]) else nullcontext():
                 await self._in_turn(scope, receive, send, kind, client)
         except (Full, BodyRefused) as refused:
             await _refusal(refused.status, str(refused), 1.0)(scope, receive, send)
