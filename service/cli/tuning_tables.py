@@ -36,8 +36,8 @@ _COLUMNS = (
     ("peak\nload", "peak", "load"),
     ("IAE\nload", "IAE", "load"),
 )
-_LEFT_OUT = (6, 5, 2, 4, 1, 7, 3)
-"""The places of the columns that a terminal too narrow for all of them leaves out, the least needed first."""
+_LEAST_NEEDED = ("peak\nload", "IAE\nSP", "PM\ndeg", "settling\ns", "GM\n", "IAE\nload", "over-\nshoot %")
+"""The columns that a terminal too narrow for all of them leaves out, the least needed first."""
 
 
 def methods(found: Iterable[Method]) -> None:
@@ -90,16 +90,13 @@ def tunings(answer: TuningsView | AlternativesView, faceplate: Faceplate = ISA_I
 def _show_figures(tuned: Sequence[TunedView], faceplate: Faceplate, recommended: str | None) -> list[str]:
     """Shows the gains and figures of each method, and returns the names of the figures for which there is no place."""
     whole = console.options.update(width=_UNBOUNDED)
-    shown = list(_COLUMNS)
-    table = _table(tuned, faceplate, recommended, shown)
-    for place in _LEFT_OUT:
+    for count in range(len(_LEAST_NEEDED) + 1):
+        left_out = _LEAST_NEEDED[:count]
+        table = _table(tuned, faceplate, recommended, [each for each in _COLUMNS if each[0] not in left_out])
         if console.measure(table, options=whole).maximum <= console.width:
             break
-        shown.remove(_COLUMNS[place])
-        table = _table(tuned, faceplate, recommended, shown)
     console.print(table)
-    names = [heading for heading, name, part in _COLUMNS if (heading, name, part) not in shown]
-    return [name.replace("-\n", "").replace("\n", " ").strip() for name in names]
+    return [heading.replace("-\n", "").replace("\n", " ").strip() for heading, *_ in _COLUMNS if heading in left_out]
 
 
 def _table(
