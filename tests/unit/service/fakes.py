@@ -12,10 +12,11 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from sqlalchemy.exc import OperationalError
 
 from loopwright.service.execution.procedures import Hooks, Outcome, Rehearse
 from loopwright.service.inputs.config import LoopConfig, parse_site
-from loopwright.service.inputs.request import RetuneRequest
+from loopwright.service.inputs.request import FastRetune, RetuneRequest
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loops.loop import Loop, Restored
 from loopwright.service.results import (
@@ -36,7 +37,7 @@ from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Mode, Note, Sample, SetGains, SetSetpoint, StageDone, StageStarted
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused
-from tests.unit.service.processes import until
+from tests.unit.service.processes import PATIENCE_S, until
 
 OLD, NEW = Gains(0.5, 2.0), Gains(0.75, 3.0)
 TAG = "TIC-101"
@@ -302,6 +303,11 @@ def store_in(folder: Path) -> Store:
     return Store(folder)
 
 
+def away(*_: object, **__: object) -> Any:
+    """In the place of what reads or writes the database: it is locked, or its server is gone."""
+    raise OperationalError("SELECT", {}, Exception("server closed the connection"))
+
+
 class Service:
     """Everything of a service that a test wants to put a hand on."""
 
@@ -320,6 +326,13 @@ class Service:
         jobs = make_jobs(self.loops, self.store, open_loop, self.tune, rehearse, **settings)
         jobs.boot()
         return jobs
+
+    def under_test(self) -> str:
+        """The id of a job whose loop is under test, until `tune.hold` is set."""
+        self.tune.hold.clear()
+        job_id = self.jobs.start(TAG, FastRetune()).id
+        assert self.tune.inside.wait(PATIENCE_S)
+        return job_id
 
     def wait(self, job_id: str) -> None:
         """Until the job is over."""

@@ -10,12 +10,10 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy.exc import OperationalError
 
 from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.places import Full, Places, stops_a_test
-from loopwright.service.inputs.request import FastRetune
 from loopwright.service.security.keys import Scope, new_key
 from loopwright.service.security.sessions import BrowserSessions
 from loopwright.service.store import audit
@@ -25,21 +23,10 @@ from loopwright.service.store.keyring import ABORTS_FOR_S, REVOKED_WITHIN_S, Key
 from loopwright.service.store.tables import AuditRow
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.api.test_api import assert_problem
-from tests.unit.service.fakes import TAG, Service
+from tests.unit.service.fakes import TAG, Service, away
 from tests.unit.service.processes import PATIENCE_S, until
 
 KEY = {"Idempotency-Key": "7f1c4f5e-2b8f-4a36-9f3a-5d0b3c1e8a77"}
-
-
-def away(*_: Any, **__: Any) -> Any:
-    raise OperationalError("SELECT", {}, Exception("server closed the connection"))
-
-
-def under_test(service: Service) -> str:
-    service.tune.hold.clear()
-    job_id = service.jobs.start(TAG, FastRetune()).id
-    assert service.tune.inside.wait(PATIENCE_S)
-    return job_id
 
 
 def aborted(service: Service, job_id: str) -> AuditRow:
@@ -76,7 +63,7 @@ def test_with_an_idempotency_key_it_does_not_wait_for_the_claim(
         assert free.wait(PATIENCE_S)
         away()
 
-    job_id = under_test(service)
+    job_id = service.under_test()
     monkeypatch.setattr(IdempotencyKeys, "_claim", locked)
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(client.post, f"/jobs/{job_id}/abort", json={"by": "operator A"}, headers=KEY)
@@ -92,7 +79,7 @@ def test_with_an_idempotency_key_it_does_not_wait_for_the_claim(
 def test_the_database_takes_nothing_from_the_claim_to_the_end(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id = under_test(service)
+    job_id = service.under_test()
     with monkeypatch.context() as patch:
         patch.setattr(service.store, "writing", away)
         first = client.post(f"/jobs/{job_id}/abort", json={"by": "operator A"}, headers=KEY)
@@ -130,7 +117,7 @@ def with_a_key_of_another_request(client: TestClient, path: str) -> int:
 def test_a_refused_one_is_heard_and_written_down(
     service: Service, client: TestClient, ask: Callable[[TestClient, str], int], status: int
 ) -> None:
-    job_id = under_test(service)
+    job_id = service.under_test()
     assert ask(client, f"/jobs/{job_id}/abort") == status
     assert aborted(service, job_id).who == "local"
 
@@ -145,7 +132,7 @@ def test_a_job_that_ends_while_the_request_waits_was_aborted_by_it(
         until(lambda: service.jobs.running(job_id) is None)
         return write(job_id, *more)
 
-    job_id = under_test(service)
+    job_id = service.under_test()
     monkeypatch.setattr(service.store, "request_stop", slow)
     answer = client.post(f"/jobs/{job_id}/abort", json={"by": "operator A"})
     assert (answer.status_code, answer.json()["state"]) == (202, "aborted")
@@ -193,7 +180,7 @@ def door(service: Service, request: pytest.FixtureRequest) -> Iterator[Door]:
 def test_a_key_that_was_valid_aborts_while_the_keys_cannot_be_read(
     service: Service, door: Door, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    key_id, job_id = door.let_in(), under_test(service)
+    key_id, job_id = door.let_in(), service.under_test()
     with monkeypatch.context() as patch:
         door.cut_off(patch)
         assert door.client.post(f"/jobs/{job_id}/abort", json={"by": "A"}).status_code == 202
@@ -207,7 +194,7 @@ def test_an_abort_does_not_wait_long_for_keys_that_are_not_read(
     service: Service, door: Door, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     door.let_in()
-    job_id, over = under_test(service), threading.Event()
+    job_id, over = service.under_test(), threading.Event()
 
     def silent(*_: Any) -> None:
         assert over.wait(PATIENCE_S)
@@ -273,7 +260,7 @@ def test_which_keys_do_not_abort_while_the_keys_cannot_be_read(
     status = signed_in if door.signed_in else with_key
     if status is None:
         return
-    job_id = under_test(service)
+    job_id = service.under_test()
     door.let_in(scope, timedelta(hours=1))
     with monkeypatch.context() as patch:
         then(door, patch)
@@ -288,7 +275,7 @@ def test_an_abort_without_the_keys_opens_the_door_for_nothing_else(
 ) -> None:
     """Neither a key nor a session counts as looked at by it."""
     door.let_in()
-    job_id = under_test(service)
+    job_id = service.under_test()
     with monkeypatch.context() as patch:
         door.cut_off(patch)
         assert door.client.post(f"/jobs/{job_id}/abort").status_code == 202

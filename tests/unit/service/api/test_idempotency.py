@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy.exc import OperationalError
 
 from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
@@ -29,7 +28,7 @@ from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.api.test_api import GOLDEN, assert_problem
-from tests.unit.service.fakes import NEW, TAG, Service, held_acceptances
+from tests.unit.service.fakes import NEW, TAG, Service, away, held_acceptances
 from tests.unit.service.postgres import Server
 from tests.unit.service.processes import until
 
@@ -42,10 +41,6 @@ AT = datetime(2026, 1, 31, 12, tzinfo=UTC)
 
 def post(client: TestClient, path: str, body: dict[str, Any] | None = None, **headers: str) -> Any:
     return client.post(path, json=body or {}, headers=KEY | headers)
-
-
-def away(*_: Any, **__: Any) -> None:
-    raise OperationalError("SELECT", {}, Exception("server closed the connection"))
 
 
 def same(one: Any, other: Any) -> bool:

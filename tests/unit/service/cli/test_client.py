@@ -203,7 +203,7 @@ class TestFollowing:
             monkeypatch, self.stream((1, "a"), (2, "b")), httpx.ReadError("reset"), *away,
             self.stream((3, "c")), self.job("proposed"),
         )  # fmt: skip
-        assert [data["text"] for _, data in client.events("/jobs/x")] == ["a", "b", "c"]  # type: ignore[index]
+        assert [data for _, data in client.events("/jobs/x")] == [{"text": each} for each in ("a", "b", "c")]
         asked = [request.headers["last-event-id"] for request in sent if request.url.path == "/jobs/x/events"]
         assert asked == ["0"] + ["2"] * 13
 

@@ -10,7 +10,6 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 from pydantic import ValidationError
-from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from loopwright.service.api.app import create_app
@@ -32,6 +31,7 @@ from tests.unit.service.fakes import (
     FakeTune,
     Service,
     ThreadEngine,
+    away,
     fake_rehearse,
     loop_entry,
 )
@@ -555,10 +555,6 @@ def test_the_command_line_gets_the_whole_list(monkeypatch: pytest.MonkeyPatch) -
 def test_unknown(plant: Plant) -> None:
     with pytest.raises(NoSuchRetune):
         plant.fleet.get("none")
-
-
-def away(*_: Any) -> Any:
-    raise OperationalError("BEGIN IMMEDIATE", {}, Exception("database is locked"))
 
 
 def reasons(plant: Plant) -> list[Reason | None]:

@@ -30,7 +30,7 @@ from loopwright.service.store.tables import AuditRow
 from loopwright.tuning.plan import StageStarted
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.api.test_api import assert_problem
-from tests.unit.service.fakes import OLD, TAG, FakeLoop, Service
+from tests.unit.service.fakes import OLD, TAG, FakeLoop, Service, away
 from tests.unit.service.processes import until
 
 
@@ -178,18 +178,6 @@ def test_samples_of_a_rehearsal_are_kept(service: Service) -> None:
     assert {"preflight", "relay", "verify"} <= set(stages)
 
 
-def away(*_: object) -> None:
-    raise OperationalError("UPDATE", {}, Exception("database is locked"))
-
-
-def running_one(service: Service) -> str:
-    """A job whose loop is under test."""
-    service.tune.hold.clear()
-    job_id = service.jobs.start(TAG, FastRetune()).id
-    assert service.tune.inside.wait(60)
-    return job_id
-
-
 def aborts(service: Service) -> list[AuditRow]:
     return [each for each in audit.trail(service.store.engine, 100) if each.what == "abort"]
 
@@ -197,7 +185,7 @@ def aborts(service: Service) -> list[AuditRow]:
 def test_a_running_job_hears_of_an_abort_that_the_database_does_not_take(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id = running_one(service)
+    job_id = service.under_test()
     monkeypatch.setattr(service.store, "request_stop", away)
     service.jobs.abort(job_id, "me")
     service.wait(job_id)
@@ -209,7 +197,7 @@ def test_a_running_job_hears_of_an_abort_that_the_database_does_not_take(
 def test_an_abort_that_the_database_does_not_take_is_written_once_when_it_does(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id = running_one(service)
+    job_id = service.under_test()
     who = Principal("control room", Scope.OPERATE, "0123456789ab", "192.0.2.7")
     with monkeypatch.context() as patch:
         patch.setattr(service.store, "writing", away)
@@ -231,7 +219,7 @@ def test_an_abort_that_the_database_does_not_take_is_written_once_when_it_does(
 
 def test_who_aborted_is_written_also_after_the_jobs_own_end(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its way out failed, and the journal comes after the end."""
-    job_id = running_one(service)
+    job_id = service.under_test()
     waiting: list[Write] = []
     with monkeypatch.context() as patch:
         patch.setattr(service.store, "request_stop", away)
@@ -250,7 +238,7 @@ def test_who_aborted_is_written_also_after_the_jobs_own_end(service: Service, mo
 def test_a_job_that_came_to_its_own_end_has_no_abort_written_later(
     service: Service, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    job_id = running_one(service)
+    job_id = service.under_test()
     service.tune.hold.set()
     service.wait(job_id)
     service.jobs.journal.put(stop_of(job_id, Reason.OPERATOR, "me"))
@@ -272,7 +260,7 @@ def test_an_abort_of_a_waiting_job_that_the_database_does_not_take_is_refused(
 def test_an_abort_while_the_database_answers_nothing_says_that_the_job_has_heard(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id = running_one(service)
+    job_id = service.under_test()
     with monkeypatch.context() as patch:
         patch.setattr(service.store, "request_stop", away)
         patch.setattr(service.store, "get", away)
@@ -287,7 +275,7 @@ def test_an_abort_while_the_database_answers_nothing_says_that_the_job_has_heard
 def test_an_abort_that_waits_for_the_database_is_accepted_and_shown_later(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job_id = running_one(service)
+    job_id = service.under_test()
     with monkeypatch.context() as patch:
         patch.setattr(service.store, "writing", away)
         assert client.post(f"/jobs/{job_id}/abort", json={"by": "operator A"}).status_code == 202
