@@ -29,7 +29,9 @@ from loopwright.service.offline.tunings import BadTuning
 from loopwright.service.states.job_state import IllegalMove, JobState
 from loopwright.service.store.claims import StillAnswering
 from loopwright.service.store.damage import is_damage
-from loopwright.service.store.store import Busy, FolderInUse, NoSuchJob
+from loopwright.service.store.job_rows import NoSuchJob
+from loopwright.service.store.lock import FolderInUse
+from loopwright.service.store.store import Busy
 from loopwright.tuning.reasons import ADVICE, Ended, Reason, Refused
 
 MEDIA_TYPE = "application/problem+json"

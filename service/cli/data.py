@@ -43,7 +43,7 @@ def restore(
     """Restores a back-up as the data of a stopped service. Jobs that were active in the back-up end as interrupted."""
     from loopwright.service.store.backup import BackupProblem
     from loopwright.service.store.backup import restore as run
-    from loopwright.service.store.store import FolderInUse
+    from loopwright.service.store.lock import FolderInUse
 
     _only_files()
     try:
@@ -69,7 +69,7 @@ def check_data(
     from loopwright.service.store.check_data import CheckProblem
     from loopwright.service.store.check_data import check_data as check
     from loopwright.service.store.check_data import salvage as copy
-    from loopwright.service.store.store import FolderInUse
+    from loopwright.service.store.lock import FolderInUse
 
     _only_files()
     try:

@@ -234,7 +234,8 @@ def serve(
         from loopwright.service.server.serving import NotSafe, Setup
         from loopwright.service.server.serving import serve as run
         from loopwright.service.store.database import BadDatabase
-        from loopwright.service.store.store import FolderInUse, ForeignLoop
+        from loopwright.service.store.lock import FolderInUse
+        from loopwright.service.store.store import ForeignLoop
 
     if log_format not in ("text", "json"):
         die(f"--log-format must be text or json, not {log_format!r}", 2)

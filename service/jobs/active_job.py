@@ -11,7 +11,7 @@ from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.progress import Progress
 from loopwright.service.jsonable import to_json_object
 from loopwright.service.loops.observed_loop import ObservedLoop
-from loopwright.service.store.store import block_of, event_of
+from loopwright.service.store.journal_writes import block_of, event_of
 from loopwright.service.telemetry.metrics import STAGE_SECONDS
 from loopwright.tuning.plan import Event, Note, Sample, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason

@@ -36,8 +36,11 @@ from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.states.job_state import IllegalMove
 from loopwright.service.store import retunes
+from loopwright.service.store.clock import now
+from loopwright.service.store.journal_writes import as_asked
+from loopwright.service.store.lock import FolderInUse
 from loopwright.service.store.retunes import Part, RetuneOver, StopReason
-from loopwright.service.store.store import Busy, FolderInUse, as_asked, now
+from loopwright.service.store.store import Busy
 from loopwright.service.store.tables import RetuneRow
 from loopwright.tuning.reasons import Reason
 

@@ -13,7 +13,9 @@ from collections import deque
 
 from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError, SQLAlchemyError, TimeoutError
 
-from loopwright.service.store.store import FolderInUse, Store, Write
+from loopwright.service.store.journal_writes import Write
+from loopwright.service.store.lock import FolderInUse
+from loopwright.service.store.store import Store
 
 log = logging.getLogger(__name__)
 

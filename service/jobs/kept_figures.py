@@ -16,7 +16,8 @@ from loopwright.service.jobs.job_figures import VERSION, JobFigures, job_figures
 from loopwright.service.states.job_state import ACTIVE
 from loopwright.service.store import job_figures as stored
 from loopwright.service.store.jobs import Job
-from loopwright.service.store.store import FolderInUse, Store
+from loopwright.service.store.lock import FolderInUse
+from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import Ended
 
 log = logging.getLogger(__name__)

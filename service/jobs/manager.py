@@ -32,9 +32,11 @@ from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswere
 from loopwright.service.jobs.worker import Worker
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.states.job_state import ACTIVE, IllegalMove, JobState
+from loopwright.service.store.job_rows import NoSuchJob
 from loopwright.service.store.jobs import Job
-from loopwright.service.store.lock import CHECK_S
-from loopwright.service.store.store import FolderInUse, NoSuchJob, Store, WithJob, stop_of
+from loopwright.service.store.journal_writes import stop_of
+from loopwright.service.store.lock import CHECK_S, FolderInUse
+from loopwright.service.store.store import Store, WithJob
 from loopwright.service.store.tables import JobRow
 from loopwright.tuning.reasons import Reason
 

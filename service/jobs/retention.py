@@ -19,7 +19,8 @@ from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.store import audit, history, hosts, knowledge
 from loopwright.service.store.clock import stamp
 from loopwright.service.store.clock_watch import ClockWatch, longest_stop
-from loopwright.service.store.store import Store, append
+from loopwright.service.store.job_rows import append
+from loopwright.service.store.store import Store
 from loopwright.service.store.tables import ChunkRow, JobFiguresRow, JobKnowledgeRow, JobRow
 from loopwright.service.telemetry.metrics import CLOCK_JUMPS
 

@@ -41,9 +41,10 @@ from loopwright.service.planning.t95 import t95_mismatch
 from loopwright.service.states.job_state import ACTIVE, GOOD, IllegalMove, JobState, state_after
 from loopwright.service.states.loop_state import LoopState, differences, loop_state, same_gains, state_json
 from loopwright.service.store import looked_after
+from loopwright.service.store.job_rows import NoSuchJob
 from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.lock import FolderInUse
-from loopwright.service.store.store import NoSuchJob, Store
+from loopwright.service.store.store import Store
 from loopwright.service.telemetry.logs import about
 from loopwright.tuning.fast.excitation_choice import NOT_ASKED
 from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant

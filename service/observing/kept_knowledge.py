@@ -16,7 +16,8 @@ from loopwright.service.results import Finding, KnowledgeView
 from loopwright.service.states.loop_state import loop_state
 from loopwright.service.store import knowledge as stored
 from loopwright.service.store.jobs import Job
-from loopwright.service.store.store import FolderInUse, Store
+from loopwright.service.store.lock import FolderInUse
+from loopwright.service.store.store import Store
 from loopwright.tuning.gains import Gains
 
 log = logging.getLogger(__name__)

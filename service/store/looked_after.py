@@ -12,8 +12,10 @@ from sqlalchemy.orm import Session
 
 from loopwright.service.jsonable import json_object
 from loopwright.service.store import alarms, audit
+from loopwright.service.store.job_rows import append, set_columns
 from loopwright.service.store.jobs import Job, JobColumns
-from loopwright.service.store.store import Store, Write, append, set_columns
+from loopwright.service.store.journal_writes import Write
+from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow
 
 

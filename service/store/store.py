@@ -5,9 +5,7 @@ from __future__ import annotations
 import secrets
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from contextvars import Context
-from dataclasses import asdict
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Unpack
 
@@ -15,11 +13,9 @@ from sqlalchemy import ColumnElement, delete, func, select, update
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError, TimeoutError
 from sqlalchemy.orm import Session
 
-from loopwright.service.jsonable import JsonObject, json_object, to_jsonable
-from loopwright.service.security.principal import current as principal
-from loopwright.service.states.job_state import ACTIVE, MOVES, IllegalMove, JobState, shown
-from loopwright.service.states.loop_state import gains_of, same_gains
-from loopwright.service.store import audit, claims, late, loop_locks, retunes, sample_blocks
+from loopwright.service.jsonable import json_object
+from loopwright.service.states.job_state import ACTIVE, JobState
+from loopwright.service.store import audit, claims, job_rows, late, loop_locks, retunes, sample_blocks
 from loopwright.service.store.clock import now
 from loopwright.service.store.damage import Damage
 from loopwright.service.store.database import (
@@ -36,27 +32,16 @@ from loopwright.service.store.database import (
 )
 from loopwright.service.store.events import events
 from loopwright.service.store.jobs import Job, JobColumns, JobEvent
-from loopwright.service.store.lock import FolderInUse, FolderLock, HostLock, ourselves
+from loopwright.service.store.lock import FolderLock, HostLock, ourselves
 from loopwright.service.store.tables import ChunkRow, EventRow, HostRow, JobRow, LoopRow, RetuneRow
 from loopwright.tuning.plan import Sample
 from loopwright.tuning.reasons import Reason
 
-__all__ = ["Busy", "FolderInUse", "ForeignLoop", "NoSuchJob", "OnMove", "Store", "WithJob", "Write", "now"]
-
-Write = Callable[[Session], None]
-"""A piece of a transaction, for the journal."""
 WithJob = Callable[[Session, JobRow], None]
 """A piece of the transaction that makes or moves a job."""
 OnMove = Callable[[Session, Job], None]
 """A piece of the transaction in which a job has moved."""
 LOCAL = "local"
-DECISIONS = {JobState.ACCEPTED: "accept", JobState.ROLLED_BACK: "rollback"}
-"""What the audit log calls the moves that somebody decides."""
-_BEGUN = "decision_begun"
-"""The event that a decision writes before it writes to the controller: only without it is a proposal known to have
-left the old gains in effect. Its decision is `unknown` where the database may be older than the last decision."""
-_CUT_SHORT = (JobState.ABORTED, JobState.FAILED)
-"""Ends of a job that was told to stop; `failed` where its loop could not be restored."""
 _BLOCKS_AT_ONCE = 16
 _JOBS_AT_ONCE = 100
 _ACTIVE = [state.value for state in ACTIVE]
@@ -68,14 +53,6 @@ class Busy(Exception):
     def __init__(self, loop: str, job_id: str, detail: str = "") -> None:
         super().__init__(detail or f"loop {loop} is busy with job {job_id}: wait for its end, or abort it")
         self.loop = loop
-        self.job_id = job_id
-
-
-class NoSuchJob(Exception):
-    """No job of that id."""
-
-    def __init__(self, job_id: str) -> None:
-        super().__init__(f"there is no job {job_id}")
         self.job_id = job_id
 
 
@@ -253,7 +230,7 @@ class Store:
                     loop_locks.check(session, loop)
                 session.add(row)
                 session.flush()
-                append(session, row.id, "state", {"state": row.state, "by": requested_by}, 0.0)
+                job_rows.append(session, row.id, "state", {"state": row.state, "by": requested_by}, 0.0)
                 claims.made(session, f"/jobs/{row.id}")
                 audit.record(session, "retune", row.id, after=row.request, loop=loop, said_by=requested_by)
                 if also is not None:
@@ -276,7 +253,7 @@ class Store:
         """Moves the job as the table allows and sets the columns, in one transaction with its event and with what is
         to be stored also. Raises IllegalMove, and Locked where its test is to begin."""
         with self.writing() as session:
-            row = _move(session, _find(session, job_id, lock=True), wanted, by, columns)
+            row = job_rows.move(session, job_rows.find(session, job_id, lock=True), wanted, by, columns)
             if also is not None:
                 also(session, row)
             return self._moved(session, row)
@@ -284,10 +261,10 @@ class Store:
     def decline(self, job_id: str, by: str) -> Job | None:
         """Rolls back a proposal of which nothing was written to the controller; None when it is no such one."""
         with self.writing() as session:
-            row = _find(session, job_id, lock=True)
-            if row.state != JobState.PROPOSED or _last_begun(session, job_id) is not None:
+            row = job_rows.find(session, job_id, lock=True)
+            if row.state != JobState.PROPOSED or job_rows.last_begun(session, job_id) is not None:
                 return None
-            return self._moved(session, _move(session, row, JobState.ROLLED_BACK, by, {}))
+            return self._moved(session, job_rows.move(session, row, JobState.ROLLED_BACK, by, {}))
 
     def _moved(self, session: Session, row: JobRow) -> Job:
         job = Job.from_row(row)
@@ -298,36 +275,37 @@ class Store:
     def decision_begun(self, job_id: str) -> bool:
         """Whether any decision on the job may have written to the controller."""
         with self._session() as session:
-            return _last_begun(session, job_id) is not None
+            return job_rows.last_begun(session, job_id) is not None
 
     def begin_decision(self, job_id: str, wanted: JobState, by: str) -> None:
         """Notes that the controller is about to be written to. Raises IllegalMove when another was faster, Locked."""
         with self.writing() as session:
-            row = _find(session, job_id, lock=True)
-            _check(session, row, wanted)
+            row = job_rows.find(session, job_id, lock=True)
+            job_rows.check(session, row, wanted)
             loop_locks.check(session, row.loop)
-            append(session, job_id, _BEGUN, {"decision": DECISIONS[wanted], "by": by}, row.plant_time_s)
+            details = {"decision": job_rows.DECISIONS[wanted], "by": by}
+            job_rows.append(session, job_id, job_rows.BEGUN, details, row.plant_time_s)
 
     def doubt_proposals(self, why: str) -> None:
         """Notes of the proposals of every host that a decision may have been made about them which is not in this
         database: a rollback then reads the controller, and puts the old gains back where it holds the new ones."""
         with self.writing() as session:
-            _doubt_proposals(session, why)
+            job_rows.doubt_proposals(session, why)
 
     def resumed(self, job_id: str, details: Mapping[str, object], **columns: Unpack[JobColumns]) -> None:
         """Notes that an active job has begun another attempt. Raises IllegalMove when it is over, Locked."""
         with self.writing() as session:
-            row = _find(session, job_id, lock=True)
+            row = job_rows.find(session, job_id, lock=True)
             if row.state not in ACTIVE:
-                raise late.too_late(row, row.state, JobState.RUNNING, _decided(session, row))
-            _may_begin(session, row)
-            set_columns(row, columns)
-            append(session, job_id, "resumed", details, row.plant_time_s)
+                raise late.too_late(row, row.state, JobState.RUNNING, job_rows.decided(session, row))
+            job_rows.may_begin(session, row)
+            job_rows.set_columns(row, columns)
+            job_rows.append(session, job_id, "resumed", details, row.plant_time_s)
 
     def note(self, job_id: str, **columns: Unpack[JobColumns]) -> None:
         """Sets columns of an active job."""
         with self.writing() as session:
-            set_columns(_find(session, job_id, lock=True), columns)
+            job_rows.set_columns(job_rows.find(session, job_id, lock=True), columns)
 
     def note_session(self, job_id: str, number: int) -> None:
         """The session that is about to be opened for the job; 0: it was refused, and there is none."""
@@ -335,7 +313,7 @@ class Store:
 
     def get(self, job_id: str) -> Job:
         with self._session() as session:
-            return Job.from_row(_find(session, job_id))
+            return Job.from_row(job_rows.find(session, job_id))
 
     def retune_of(self, job_id: str) -> str | None:
         """Id of the retune of many loops that has begun the job; None: there is none."""
@@ -359,7 +337,7 @@ class Store:
     def check_move(self, job_id: str, wanted: JobState) -> None:
         """Raises IllegalMove, with words for who asks for it, unless the job may become so."""
         with self._session() as session:
-            _check(session, _find(session, job_id), wanted)
+            job_rows.check(session, job_rows.find(session, job_id), wanted)
 
     def busy(self) -> dict[str, str]:
         """The active job by loop, of every host."""
@@ -391,13 +369,13 @@ class Store:
         heard: the job knows of this request already, and may have ended for it by now.
         """
         with self.writing() as session:
-            return Job.from_row(_note_stop(session, job_id, reason, by, heard))
+            return Job.from_row(job_rows.note_stop(session, job_id, reason, by, heard))
 
     def decision_failed(self, job_id: str, wanted: JobState, by: str, detail: str) -> None:
         """A decision that reached for the controller and ended in an error: its gains may have been written."""
         with self.writing() as session:
-            row = _find(session, job_id)
-            what = f"{DECISIONS[wanted]}_failed"
+            row = job_rows.find(session, job_id)
+            what = f"{job_rows.DECISIONS[wanted]}_failed"
             audit.record(
                 session, what, job_id, before={"state": row.state}, after={"error": detail}, loop=row.loop, said_by=by
             )
@@ -445,8 +423,8 @@ class Store:
     # events
     def append(self, job_id: str, kind: str, data: Mapping[str, object], plant_time_s: float) -> None:
         with self.writing() as session:
-            _find(session, job_id, lock=True)
-            append(session, job_id, kind, data, plant_time_s)
+            job_rows.find(session, job_id, lock=True)
+            job_rows.append(session, job_id, kind, data, plant_time_s)
 
     def events(self, job_id: str, after: int = 0, limit: int | None = None) -> Sequence[JobEvent]:
         """In order; after: only those with a larger number."""
@@ -471,7 +449,7 @@ class Store:
             detail = f"was {row.state} when the back-up was made that has now been restored"
             self.move(row.id, JobState.INTERRUPTED, reason=Reason.SERVICE_STOPPED.value, detail=detail)
         with self.writing() as session:
-            _doubt_proposals(session, f"the back-up {source} was restored")
+            job_rows.doubt_proposals(session, f"the back-up {source} was restored")
             for retune in retunes.unfinished(session, self.host):
                 detail = f"was {retune.state} when the back-up was made that has now been restored"
                 retunes.stop(session, retune.id, retunes.StopReason.SERVICE_STOPPED, detail)
@@ -528,72 +506,6 @@ def is_shown_as(state: JobState) -> ColumnElement[bool]:
     return stored
 
 
-def event_of(
-    job_id: str, kind: str, data: Mapping[str, object], plant_time_s: float, stage: str | None = None
-) -> Write:
-    """An event, at the time it happened, stored once. stage: the one that the job has entered with it."""
-    at, details = now(), json_object(data)
-    seq = 0
-
-    def write(session: Session) -> None:
-        nonlocal seq
-        row = _find(session, job_id, lock=True)
-        stored = session.get(EventRow, (job_id, seq)) if seq else None
-        if stored is not None and (stored.at, stored.kind, stored.data) == (at, kind, details):
-            return  # only the answer to the COMMIT was lost
-        row.plant_time_s = plant_time_s
-        if stage is not None:
-            row.stage = stage
-        seq = append(session, job_id, kind, details, plant_time_s, at)
-
-    return write
-
-
-def stop_of(job_id: str, reason: Reason, by: str) -> Write:
-    """What `request_stop` notes of a request that its job has heard: by the present principal, at this time."""
-    at = now()
-
-    def write(session: Session) -> None:
-        with suppress(IllegalMove):  # the job had come to its own end when it heard
-            _note_stop(session, job_id, reason, by, heard=True, at=at)
-
-    return as_asked(write)
-
-
-def as_asked(write: Write) -> Write:
-    """The same write for the journal's thread: by the present principal, and with the present idempotency key."""
-    request = Context()
-    request.run(principal.set, principal.get())
-    request.run(claims.current.set, claims.current.get())
-    return lambda session: request.run(write, session)
-
-
-def block_of(job_id: str, stage: str, samples: Sequence[Sample]) -> Write:
-    """A block of samples of one stage, stored once, packed now: a database that is away does not fill the memory."""
-    first_t_s, count, data = samples[0].t, len(samples), sample_blocks.pack(samples)
-    seq = 0
-
-    def write(session: Session) -> None:
-        nonlocal seq
-        stored = session.get(ChunkRow, (job_id, seq)) if seq else None
-        if stored is not None and (stored.first_t_s, stored.data) == (first_t_s, data):
-            return  # only the answer to the COMMIT was lost
-        seq = 1 + (session.scalar(select(func.max(ChunkRow.seq)).where(ChunkRow.job_id == job_id)) or 0)
-        session.add(ChunkRow(job_id=job_id, seq=seq, stage=stage, first_t_s=first_t_s, count=count, data=data))
-        session.flush()
-
-    return write
-
-
-def _find(session: Session, job_id: str, lock: bool = False) -> JobRow:
-    """lock: nobody else, on whatever host, changes the job or appends to it before this transaction ends."""
-    wanted = select(JobRow).where(JobRow.id == job_id)
-    row = session.scalars(wanted.with_for_update() if lock else wanted).one_or_none()
-    if row is None:
-        raise NoSuchJob(job_id)
-    return row
-
-
 def of_host(session: Session, host: str) -> HostRow:
     """What the host keeps of itself; a row is made if there is none."""
     row = session.get(HostRow, host)
@@ -601,113 +513,3 @@ def of_host(session: Session, host: str) -> HostRow:
         row = HostRow(host=host)
         session.add(row)
     return row
-
-
-def set_columns(row: JobRow, columns: JobColumns) -> None:
-    for name, value in columns.items():
-        setattr(row, name, to_jsonable(value))
-
-
-def _may_begin(session: Session, row: JobRow) -> None:
-    """Raises Locked."""
-    if not row.dry_run:
-        loop_locks.check(session, row.loop)
-
-
-def _move(session: Session, row: JobRow, wanted: JobState, by: str, columns: JobColumns) -> JobRow:
-    previous = row.state
-    _check(session, row, wanted)
-    if wanted is JobState.RUNNING:
-        _may_begin(session, row)
-    row.state = wanted
-    set_columns(row, columns)
-    if wanted is JobState.RUNNING:
-        row.started_at = now()
-    elif previous in ACTIVE:
-        row.ended_at = now()
-    details = {"state": wanted.value, "from": previous.value, "by": by}
-    details |= {key: columns[key] for key in ("reason", "detail") if columns.get(key)}
-    append(session, row.id, "state", details, row.plant_time_s)
-    if wanted in DECISIONS:
-        claims.changed(session, f"/jobs/{row.id}")
-        held = (row.restored or {}).get("gains") if "restored" in columns else None
-        _audit_decision(session, row, previous, wanted, by, held if isinstance(held, dict) else None)
-    return row
-
-
-def _check(session: Session, row: JobRow, wanted: JobState) -> None:
-    """Raises IllegalMove, with words for who asks for it, unless the job may become so."""
-    present = shown(row.state, row.dry_run)
-    if wanted not in MOVES[present]:
-        raise late.too_late(row, present, wanted, _decided(session, row))
-
-
-def _note_stop(session: Session, job_id: str, reason: Reason, by: str, heard: bool, at: str | None = None) -> JobRow:
-    """at: when it was asked; None for now. Raises IllegalMove when the job is over, unless it may be so for this."""
-    row = _find(session, job_id, lock=True)
-    if not (heard and row.stop_reason is None and row.state in _CUT_SHORT):
-        _check(session, row, JobState.ABORTED)
-    claims.changed(session, f"/jobs/{job_id}")
-    if row.stop_reason is None:
-        row.stop_reason = reason
-        append(session, job_id, "abort_requested", {"by": by}, row.plant_time_s, at)
-        before = row.state if row.state in ACTIVE else JobState.RUNNING
-        audit.record(session, "abort", job_id, before={"state": before}, loop=row.loop, said_by=by, at=at)
-    return row
-
-
-def _decided(session: Session, row: JobRow) -> late.Decided | None:
-    """Who has decided the job last; None: nobody has."""
-    if row.state not in DECISIONS:
-        return None
-    mine = (EventRow.job_id == row.id, EventRow.kind == "state")
-    event = session.scalars(select(EventRow).where(*mine).order_by(EventRow.seq.desc()).limit(1)).one_or_none()
-    return None if event is None else late.Decided(str(event.data.get("by", "")), event.at)
-
-
-def _last_begun(session: Session, job_id: str) -> str | None:
-    """What the last decision that was about to write to the controller wanted, as in DECISIONS."""
-    mine = (EventRow.job_id == job_id, EventRow.kind == _BEGUN)
-    event = session.scalars(select(EventRow).where(*mine).order_by(EventRow.seq.desc()).limit(1)).one_or_none()
-    return None if event is None else str(event.data["decision"])
-
-
-def _doubt_proposals(session: Session, why: str) -> None:
-    begun = select(EventRow.seq).where(EventRow.job_id == JobRow.id, EventRow.kind == _BEGUN).exists()
-    proposals = (JobRow.state == JobState.PROPOSED, JobRow.dry_run.is_(False), ~begun)
-    for row in session.scalars(select(JobRow).where(*proposals).order_by(JobRow.number).with_for_update()).all():
-        append(session, row.id, _BEGUN, {"decision": "unknown", "by": "service", "detail": why}, row.plant_time_s)
-
-
-def _audit_decision(
-    session: Session, row: JobRow, previous: JobState, wanted: JobState, by: str, held: JsonObject | None
-) -> None:
-    """held: the gains read back after the decision, where it went to the controller."""
-    proposed = None if row.result is None else row.result.new_gains
-    old, new = row.old_gains, None if proposed is None else asdict(proposed.gains())
-    has = new if wanted is JobState.ACCEPTED else old
-    # A rollback that had to write found the new gains, of an acceptance that had ended in an error too.
-    had = new if wanted is JobState.ROLLED_BACK and _last_begun(session, row.id) == DECISIONS[wanted] else old
-    if held and not any(same_gains(gains_of(held), gains_of(one)) for one in (old, new) if one):
-        had = has = held  # somebody else's: found, and left
-    audit.record(
-        session,
-        DECISIONS[wanted],
-        row.id,
-        before={"state": previous.value, "gains": had},
-        after={"state": wanted.value, "gains": has},
-        loop=row.loop,
-        said_by=by,
-    )
-
-
-def append(
-    session: Session, job_id: str, kind: str, data: Mapping[str, object], plant_time_s: float, at: str | None = None
-) -> int:
-    """The next event of a job whose row this transaction has locked. Returns its number."""
-    seq = 1 + (session.scalar(select(func.max(EventRow.seq)).where(EventRow.job_id == job_id)) or 0)
-    session.add(
-        EventRow(job_id=job_id, seq=seq, at=at or now(), plant_time_s=plant_time_s, kind=kind, data=json_object(data))
-    )
-    session.flush()
-    return seq

@@ -31,7 +31,8 @@ from loopwright.service.server.assembly import make_jobs
 from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.states.loop_state import OPERATIONAL, LoopState, differences, same_gains
 from loopwright.service.store.database import FILE
-from loopwright.service.store.store import Store, block_of
+from loopwright.service.store.journal_writes import block_of
+from loopwright.service.store.store import Store
 from loopwright.tuning.analysis.comparison import Predicted
 from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.gains import Gains

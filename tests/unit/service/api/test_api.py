@@ -11,7 +11,7 @@ from sqlalchemy import event
 
 from loopwright.service.jobs import worker
 from loopwright.service.planning.t95 import t95_mismatch
-from loopwright.service.store.store import append
+from loopwright.service.store.job_rows import append
 from loopwright.tuning.reasons import ADVICE, Failed, Reason, Refused
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
 from tests.unit.service.processes import until

@@ -18,10 +18,10 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import datetime, tzinfo
 from ipaddress import ip_network
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import yaml
 
@@ -34,7 +34,7 @@ from loopwright.service.loops.loop import Loop, Restored
 from loopwright.service.server import serving
 from loopwright.service.server.serving import Setup, open_bus_loop, serve
 from loopwright.service.states.loop_state import LoopState, differences, loop_state, state_json
-from loopwright.service.store import store
+from loopwright.service.store import clock
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Mode, Sample, SetGains, SetSetpoint, StageDone, StageStarted
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
@@ -146,7 +146,13 @@ def set_back(flag: Path, seconds: float) -> None:
     """The wall clock of this process is that much behind from the moment on in which the flag is there."""
     real = time.time
     time.time = lambda: real() - (seconds if flag.exists() else 0.0)
-    store.now = lambda: datetime.fromtimestamp(time.time(), UTC).isoformat(timespec="milliseconds")
+
+    class Clock(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> Self:
+            return cls.fromtimestamp(time.time(), tz)
+
+    vars(clock)["datetime"] = Clock
 
 
 def ended_by(sent: signal.Signals, when: str, name: str) -> None:

@@ -21,8 +21,9 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store import audit, retunes
+from loopwright.service.store.journal_writes import Write
 from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver
-from loopwright.service.store.store import Store, Write
+from loopwright.service.store.store import Store
 from loopwright.service.store.tables import RetuneRow
 from loopwright.tuning.reasons import Aborted, Failed, Reason, Refused
 from tests.unit.service.fakes import (

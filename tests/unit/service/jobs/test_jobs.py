@@ -24,8 +24,10 @@ from loopwright.service.security.principal import current as principal
 from loopwright.service.states.job_state import IllegalMove, JobState
 from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store import audit
+from loopwright.service.store.clock import now
 from loopwright.service.store.jobs import Job
-from loopwright.service.store.store import Store, Write, now, stop_of
+from loopwright.service.store.journal_writes import Write, stop_of
+from loopwright.service.store.store import Store
 from loopwright.service.store.tables import AuditRow
 from loopwright.tuning.plan import StageStarted
 from loopwright.tuning.reasons import Failed, Reason

@@ -13,7 +13,8 @@ from sqlalchemy.orm import Session
 
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.journal import Journal
-from loopwright.service.store.store import Store, Write, event_of
+from loopwright.service.store.journal_writes import Write, event_of
+from loopwright.service.store.store import Store
 from loopwright.service.store.tables import ChunkRow
 from loopwright.tuning.plan import Sample, StageDone, StageStarted
 

@@ -15,8 +15,10 @@ from sqlalchemy.orm import Session
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.jobs.journal import Journal
 from loopwright.service.states.job_state import JobState
+from loopwright.service.store.job_rows import NoSuchJob
 from loopwright.service.store.jobs import Job
-from loopwright.service.store.store import NoSuchJob, Store, block_of, event_of
+from loopwright.service.store.journal_writes import block_of, event_of
+from loopwright.service.store.store import Store
 from loopwright.tuning.plan import Sample
 from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.service.api.test_api import assert_problem

@@ -13,7 +13,7 @@ from loopwright.service.cli.main import app
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.server import serving
-from loopwright.service.store.store import FolderInUse
+from loopwright.service.store.lock import FolderInUse
 from tests.unit.service.fakes import FakeTune, loop_entry
 
 

@@ -18,7 +18,8 @@ from loopwright.service.security.keys import Scope
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store.backup import BackupProblem, back_up, restore
 from loopwright.service.store.keyring import Keyring
-from loopwright.service.store.store import FolderInUse, Store
+from loopwright.service.store.lock import FolderInUse
+from loopwright.service.store.store import Store
 from loopwright.tuning.plan import Sample
 from tests.unit.service.fakes import TAG, Service, add_samples
 

@@ -25,7 +25,8 @@ from loopwright.service.jobs.dbos_engine import DurableEngine
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store.damage import FileCheck, Log, read_log
 from loopwright.service.store.database import ENGINE_FILE, FILE, BadDatabase
-from loopwright.service.store.store import Store, event_of
+from loopwright.service.store.journal_writes import event_of
+from loopwright.service.store.store import Store
 from loopwright.tuning.plan import Sample
 from tests.unit.service.fakes import OLD, TAG, Service, add_samples
 from tests.unit.service.processes import until

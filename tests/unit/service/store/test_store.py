@@ -20,8 +20,10 @@ from loopwright.service.states.job_state import MOVES, IllegalMove, JobState
 from loopwright.service.store import database as opening
 from loopwright.service.store import lock
 from loopwright.service.store.database import USUAL, BadDatabase, urgent
+from loopwright.service.store.job_rows import NoSuchJob
 from loopwright.service.store.jobs import UnknownWord
-from loopwright.service.store.store import Busy, FolderInUse, ForeignLoop, NoSuchJob, Store
+from loopwright.service.store.lock import FolderInUse
+from loopwright.service.store.store import Busy, ForeignLoop, Store
 from loopwright.service.store.tables import Base
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Sample
