@@ -7,7 +7,7 @@ from urllib.parse import quote
 
 import typer
 
-from loopwright.service.cli.client import DEFAULT_URL, Client
+from loopwright.service.cli.client import DEFAULT_URL, Client, parsed
 from loopwright.service.cli.output import AsJson, Url, print_json, user
 
 app = typer.Typer()
@@ -34,7 +34,7 @@ def alarms(
         if as_json:
             print_json(answer)
             return
-        signed = Alarm.model_validate(answer)
+        signed = parsed(Alarm, answer)
         if signed.signed_off is not None:
             print(f"{signed.subject}: signed off by {signed.signed_off.by} at {signed.signed_off.at}: {signed.text}")
         return
@@ -42,7 +42,7 @@ def alarms(
     if as_json:
         print_json(answer)
         return
-    found = AlarmList.model_validate(answer).alarms
+    found = parsed(AlarmList, answer).alarms
     if not found:
         print("Nothing is abnormal.")
         return

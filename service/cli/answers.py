@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import BaseModel, JsonValue
 
 from loopwright.service.api.job_views import LockView
+from loopwright.service.cli.client import parsed
 from loopwright.service.states.job_state import JobState
 
 
@@ -48,7 +49,7 @@ _EVENTS: dict[str, type[ShownEvent]] = {
 def job_event(kind: str, data: object) -> ShownEvent | None:
     """Returns an event of GET /jobs/{id}/events; None for a kind that the commands do not show."""
     model = _EVENTS.get(kind)
-    return None if model is None else model.model_validate(data)
+    return None if model is None else parsed(model, data)
 
 
 class JobAnswer(BaseModel):

@@ -8,12 +8,14 @@ import os
 import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     import httpx
 
     from loopwright.service.cli.plots.shown import ShownSamples
+
+T = TypeVar("T")
 
 DEFAULT_URL = "http://127.0.0.1:8080"
 KEY_VARIABLE = "LOOPWRIGHT_KEY"
@@ -108,7 +110,7 @@ class Client:
         """Returns a function that gets the samples of a job, those of one stage or (None) all."""
         from loopwright.service.cli.plots.shown import ShownSamples
 
-        return lambda stage: ShownSamples.model_validate(self.get(f"{job_url}/samples", stage=stage))
+        return lambda stage: parsed(ShownSamples, self.get(f"{job_url}/samples", stage=stage))
 
     def pages(self, path: str) -> list[object]:
         """Returns all items of a list that the service returns in pages."""
@@ -192,7 +194,7 @@ class Client:
                     for fields in _events_of(answer):
                         last = fields.get("id", last)
                         yield fields["event"], json.loads(fields["data"])
-                if JobAnswer.model_validate(self._there(job_url)).state not in ACTIVE:
+                if parsed(JobAnswer, self._there(job_url)).state not in ACTIVE:
                     return
                 time.sleep(_AGAIN_S)
             except httpx.TransportError as error:
@@ -316,6 +318,24 @@ def _json(answer: httpx.Response) -> object:
     except ValueError:
         raise _no_service(answer) from None
     return found
+
+
+def parsed(form: type[T], answer: object) -> T:
+    """Returns an answer of the service, or a part of one, in its form; raises ApiError where it has another one."""
+    from importlib.metadata import version
+
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        return TypeAdapter(form).validate_python(answer)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"])) or "the whole"
+        raise ApiError(
+            f"the service has done what was asked, but answers in another form than loopwright {version('loopwright')} "
+            f"reads, first at {where} ({first['msg']}): it is of another version, which its page /docs names; use the "
+            "commands of that version"
+        ) from error
 
 
 def _no_service(answer: httpx.Response) -> ApiError:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from loopwright.service.api.job_views import JobView, LiveView, LoopDetail
 from loopwright.service.cli import job_tables, terminal
-from loopwright.service.cli.client import ApiError, Client
+from loopwright.service.cli.client import ApiError, Client, parsed
 from loopwright.service.states.job_state import JobState
 from loopwright.tuning.analysis.comparison import LoopPerformance, loop_performance
 from loopwright.tuning.fast.proposal import delayed
@@ -65,7 +65,7 @@ def demonstrate(client: Client, tag: str, methods: Sequence[str]) -> Demonstrati
     for method in methods:
         path = f"/loops/{tag}/retune"
         terminal.console.print(f"POST       {client.url}{path}  method {method}", highlight=False)
-        begun = JobView.model_validate(client.post(path, {"method": method, "requested_by": "demo"}))
+        begun = parsed(JobView, client.post(path, {"method": method, "requested_by": "demo"}))
         jobs.append(job_tables.follow(client, begun.url, terminal.console))
     return Demonstration(jobs, time.monotonic() - started)
 
@@ -106,7 +106,7 @@ def report(client: Client, tag: str, shown: Demonstration, plant: TransferFuncti
 
 
 def _loop(client: Client, tag: str) -> LoopDetail:
-    return LoopDetail.model_validate(client.get(f"/loops/{tag}"))
+    return parsed(LoopDetail, client.get(f"/loops/{tag}"))
 
 
 def _row(coefficients: Sequence[float]) -> str:

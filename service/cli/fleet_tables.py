@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from datetime import datetime
 
 from loopwright.service.cli.answers import FleetRetune, FleetSummary
-from loopwright.service.cli.client import Client
+from loopwright.service.cli.client import Client, parsed
 from loopwright.service.cli.terminal import ago, console, rows
 
 POLL_S = 1.0
@@ -19,7 +19,7 @@ def follow(client: Client, url: str, quiet: bool = False) -> object:
     shown: dict[str, int] | None = None
     while True:
         answer = client.awaited(url)
-        found = FleetRetune.model_validate(answer)
+        found = parsed(FleetRetune, answer)
         if found.counts != shown and not quiet:
             shown = found.counts
             console.print(f"  {counted(shown)}", highlight=False)

@@ -13,7 +13,7 @@ from loopwright.service.api.report.words import stage_found, stage_name
 from loopwright.service.api.watch_views import WatchView
 from loopwright.service.cli import terminal
 from loopwright.service.cli.answers import NoteEvent, ProgressEvent, StageDoneEvent, StateEvent, job_event
-from loopwright.service.cli.client import Client
+from loopwright.service.cli.client import Client, parsed
 from loopwright.service.cli.result_table import ShownResult, result_table
 from loopwright.service.cli.terminal import cell, figure
 from loopwright.service.states.job_state import JobState
@@ -47,7 +47,7 @@ def follow(client: Client, job_url: str, to: Console | None = None) -> JobView:
                     bars.console.print(f"  note: {text}", soft_wrap=True, highlight=False)
                 case StateEvent(state=state):
                     bars.update(task, description=state, left="")
-        job = JobView.model_validate(client.awaited(job_url))
+        job = parsed(JobView, client.awaited(job_url))
         # how far a job is may be told once more after its end
         bars.update(task, completed=job.progress, description=job.state, left="")
     return job

@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 import typer
 
-from loopwright.service.cli.client import DEFAULT_URL, Client
+from loopwright.service.cli.client import DEFAULT_URL, Client, parsed
 from loopwright.service.cli.output import (
     AsJson,
     AskedAim,
@@ -45,7 +45,6 @@ def path_of(client: Client, given: str) -> str:
 
     given: the id of the job, the beginning of it, or `last`.
     """
-    from pydantic import TypeAdapter
 
     from loopwright.service.api.job_views import JobView
 
@@ -57,7 +56,7 @@ def path_of(client: Client, given: str) -> str:
         wanted = {"id": given, "limit": _FEW}
     else:
         return f"/jobs/{quote(given, safe='')}"
-    found = TypeAdapter(list[JobView]).validate_python(client.get("/jobs", **wanted))
+    found = parsed(list[JobView], client.get("/jobs", **wanted))
     if not found and given == LAST:
         die("there is no job yet; begin one with: loopwright retune TAG", 2)
     if not found:
@@ -74,7 +73,7 @@ def unit_of(client: Client, tag: str) -> str:
     not configured any more."""
     from loopwright.service.api.job_views import LoopView
 
-    loops = map(LoopView.model_validate, client.pages("/loops"))
+    loops = parsed(list[LoopView], client.pages("/loops"))
     return next((loop.pv_unit for loop in loops if loop.tag == tag), "PV unit")
 
 
@@ -88,8 +87,6 @@ def list_jobs(
     """List the latest jobs."""
     from datetime import UTC, datetime
 
-    from pydantic import TypeAdapter
-
     from loopwright.service.api.job_views import JobView
     from loopwright.service.cli import job_tables, terminal
 
@@ -97,7 +94,7 @@ def list_jobs(
     if as_json:
         print_json(found)
         return
-    jobs, now = TypeAdapter(list[JobView]).validate_python(found), datetime.now(UTC)
+    jobs, now = parsed(list[JobView], found), datetime.now(UTC)
     terminal.rows(
         "jobs",
         ("id", "loop", "state", "reason", "created"),
@@ -111,8 +108,6 @@ def list_retunes(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     """List the latest retunes of many loops."""
     from datetime import UTC, datetime
 
-    from pydantic import TypeAdapter
-
     from loopwright.service.cli import fleet_tables
     from loopwright.service.cli.answers import FleetSummary
 
@@ -120,7 +115,7 @@ def list_retunes(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     if as_json:
         print_json(found)
         return
-    fleet_tables.summaries(TypeAdapter(list[FleetSummary]).validate_python(found), datetime.now(UTC))
+    fleet_tables.summaries(parsed(list[FleetSummary], found), datetime.now(UTC))
 
 
 @app.command("job")
@@ -159,14 +154,14 @@ def one_job(
         die("only one of --abort, --accept and --rollback can be given", 2)
     short = len(job_id) < _SURE
     if (accept or rollback) and (job_id == LAST or short):  # somebody else's job may have begun meanwhile
-        found = JobView.model_validate(client.get(path))
+        found = parsed(JobView, client.get(path))
         takes = f"at least {_SURE} characters of an id" if short else "an id"
         which = f"{job_id} begins that of" if short else "the last job is"
         die(f"--{decisions[0]} writes to a loop and takes {takes}: {which} {found.id}, of {found.loop}", 2)
     if not accept and not roll_back_by_itself:
         die("--no-roll-back-by-itself is for --accept", 2)
     given: dict[str, object] = {"by": "cli"} | ({"roll_back_by_itself": roll_back_by_itself} if accept else {})
-    job = JobView.model_validate(client.post(f"{path}/{decisions[0]}", given) if decisions else client.get(path))
+    job = parsed(JobView, client.post(f"{path}/{decisions[0]}", given) if decisions else client.get(path))
     if follow:
         with job_going_on(job.id):
             job = job_tables.follow(client, path)
@@ -245,6 +240,6 @@ def alternatives_of_job(
     from loopwright.service.api.tuning_views import AlternativesView
     from loopwright.service.cli import tuning_tables
 
-    alternatives = AlternativesView.model_validate(found)
+    alternatives = parsed(AlternativesView, found)
     tuning_tables.tunings(alternatives)
     tuning_tables.to_try(alternatives)

@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from loopwright.service.cli.client import Client
+from loopwright.service.cli.client import Client, parsed
 from loopwright.service.live.messages import LiveJob, LiveJobs, LiveLoopRow, Loops
 
 
@@ -36,9 +36,9 @@ def presents(client: Client, tag: str) -> Iterator[SeenLoop | str]:
             case "lost":
                 yield str(data)
             case "jobs":
-                jobs = LiveJobs.model_validate(data).jobs
+                jobs = parsed(LiveJobs, data).jobs
             case "loops":
-                seen = Loops.model_validate(data)
+                seen = parsed(Loops, data)
                 for row in seen.loops:
                     if row.tag == tag:
                         job = next((each for each in jobs if each.url == row.job), None)

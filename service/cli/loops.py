@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 import typer
 
-from loopwright.service.cli.client import DEFAULT_URL, Client
+from loopwright.service.cli.client import DEFAULT_URL, Client, parsed
 from loopwright.service.cli.output import (
     AsJson,
     AskedAim,
@@ -117,7 +117,7 @@ def one_loop(
     if as_json:
         print_json(found)
     else:
-        job_tables.loop_report(LoopDetail.model_validate(found))
+        job_tables.loop_report(parsed(LoopDetail, found))
 
 
 @app.command()
@@ -145,7 +145,7 @@ def observe(
         path, ms=ms, derivative=str(derivative).lower(), aim=aim, settling_s=settling_s, mv_peak=mv_peak,
         noise_gain=noise_gain,
     )  # fmt: skip
-    shown = ObservationView.model_validate(found)
+    shown = parsed(ObservationView, found)
     if as_json:
         print_json(found)
     else:
@@ -174,7 +174,7 @@ def lock(
     if as_json:
         print_json(answer)
         return
-    found = LockAnswer.model_validate(answer)
+    found = parsed(LockAnswer, answer)
     print(f"{tag} is locked by {found.locked.by} since {found.locked.since}: {found.locked.reason}")
     if found.note:
         print(found.note)
@@ -196,5 +196,5 @@ def unlock(
     if as_json:
         print_json(answer)
         return
-    was = UnlockAnswer.model_validate(answer).was_locked
+    was = parsed(UnlockAnswer, answer).was_locked
     print(f"{tag} was not locked" if was is None else f"{tag} is unlocked; it was locked by {was.by}: {was.reason}")

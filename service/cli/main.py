@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 import typer
 
 from loopwright.service.cli import alarms, data, identification, jobs, keys, loops, rehearse, tuning, webhooks
-from loopwright.service.cli.client import DEFAULT_URL, ApiError, Client
+from loopwright.service.cli.client import DEFAULT_URL, ApiError, Client, parsed
 from loopwright.service.cli.output import (
     AsJson,
     AskedAim,
@@ -292,7 +292,7 @@ def list_loops(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     if as_json:
         print_json(found)
         return
-    loops = [LoopView.model_validate(each) for each in found]
+    loops = parsed(list[LoopView], found)
     shown = ("tag", "description", "bus", "controller_node", "pv_unit", "t95_s", "active_job")
     terminal.rows(
         "loops",
@@ -399,9 +399,9 @@ def _other_gains(
     from loopwright.service.api.tuning_views import AlternativesView
 
     wanted = str(derivative).lower() if ms is not None else None
-    found = AlternativesView.model_validate(
-        client.computed(f"{jobs.path_of(client, job)}/alternatives", ms=ms, derivative=wanted, method=method, **options)
-    )
+    path = f"{jobs.path_of(client, job)}/alternatives"
+    answer = client.computed(path, ms=ms, derivative=wanted, method=method, **options)
+    found = parsed(AlternativesView, answer)
     if found.loop != loop:
         die(f"job {found.job} is of loop {found.loop}, not of {loop}", 2)
     (each,) = found.methods
@@ -422,7 +422,7 @@ def _previewed(
 
     answer = client.post(f"{path}/preview", body)
     many = "pattern" in body
-    found = FleetPreview.model_validate(answer) if many else Preview.model_validate(answer)
+    found = parsed(FleetPreview, answer) if many else parsed(Preview, answer)
     if as_json:
         print_json(answer)
     else:
@@ -436,14 +436,14 @@ def _one(client: Client, started: object, wait: bool, as_json: bool) -> int:
     from loopwright.service.cli import job_tables
     from loopwright.service.states.job_state import GOOD
 
-    job = JobView.model_validate(started)
+    job = parsed(JobView, started)
     if wait:
         print(f"job {job.id} of {job.loop}", file=sys.stderr)
         with job_going_on(job.id):
             if as_json:
                 for _ in client.events(job.url):
                     pass
-                job = JobView.model_validate(client.awaited(job.url))
+                job = parsed(JobView, client.awaited(job.url))
             else:
                 job = job_tables.follow(client, job.url)
     if as_json:
@@ -459,13 +459,13 @@ def _many(client: Client, started: object, wait: bool, as_json: bool) -> int:
     from loopwright.service.cli.answers import FleetRetune
     from loopwright.service.states.job_state import GOOD
 
-    answer, found = started, FleetRetune.model_validate(started)
+    answer, found = started, parsed(FleetRetune, started)
     if wait:
         print(f"retune {found.id} of {len(found.loops)} loops", file=sys.stderr)
         ends = f"end it with: POST {client.url}{found.url}/abort"
         with going_on(f"retune {found.id}", f"see it with: loopwright retunes, its jobs with: loopwright jobs, {ends}"):
             answer = fleet_tables.follow(client, found.url, quiet=as_json)
-        found = FleetRetune.model_validate(answer)
+        found = parsed(FleetRetune, answer)
     if as_json:
         print_json(answer)
     else:
@@ -484,7 +484,7 @@ def dismiss(
     if as_json:
         print_json(answer)
         return
-    jobs = DismissedView.model_validate(answer).jobs
+    jobs = parsed(DismissedView, answer).jobs
     print(f"{loop} is looked after no more ({', '.join(jobs)})" if jobs else f"{loop} was not looked after")
 
 

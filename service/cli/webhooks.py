@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from loopwright.service.cli.client import DEFAULT_URL, Client
+from loopwright.service.cli.client import DEFAULT_URL, Client, parsed
 from loopwright.service.cli.output import AsJson, Url, print_json
 
 app = typer.Typer()
@@ -15,8 +15,6 @@ def webhooks(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     """List the latest messages to webhooks, and what became of each."""
     from datetime import UTC, datetime
 
-    from pydantic import TypeAdapter
-
     from loopwright.service.api.webhooks import WebhookDelivery
     from loopwright.service.cli import terminal
 
@@ -24,7 +22,7 @@ def webhooks(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
     if as_json:
         print_json(found)
         return
-    messages, now = TypeAdapter(list[WebhookDelivery]).validate_python(found), datetime.now(UTC)
+    messages, now = parsed(list[WebhookDelivery], found), datetime.now(UTC)
     if not messages:
         print("No message has come about for a webhook.")
         return

@@ -4,7 +4,9 @@ followed over a restart of the service."""
 from __future__ import annotations
 
 import math
+import shlex
 from functools import partial
+from importlib.metadata import version
 from types import SimpleNamespace
 
 import httpx
@@ -12,6 +14,7 @@ import pytest
 
 from loopwright.service.cli import client as client_module
 from loopwright.service.cli.client import ApiError, Client, NotSent, ServiceAway
+from loopwright.service.cli.main import app
 
 
 def through(
@@ -158,6 +161,22 @@ def test_another_program_at_the_address_is_named_as_such(
         client, _ = through(monkeypatch, answer)
         with pytest.raises(ApiError, match=r"http://gateway/loops is no Loopwright service \(HTTP .*--url"):
             asked(client)
+
+
+@pytest.mark.parametrize(
+    ("command", "answer"),
+    [("loops", [{"name": "TIC-101"}]), ("jobs", [{"id": 7}]), ("job 0123456789ab", {"id": "0123456789ab"}),
+     ("job 0123456789ab --accept", {"id": "0123456789ab"}), ("job 0123456789ab --follow", {"state": "pondering"}),
+     ("loop TIC-101", {}), ("observe TIC-101", {}), ("alarms", {"alarms": None}), ("retunes", [{}]),
+     ("webhooks", [{}]), ("retune TIC-101 --preview", {}), ("retune TIC-101 --yes --wait", {}), ("dismiss TIC-101", {}),
+     ("lock TIC-101 --reason valve", {}), ("unlock TIC-101", {}), ("alternatives 0123456789ab", {})],
+)  # fmt: skip
+def test_a_service_of_another_version_is_named_as_such(
+    monkeypatch: pytest.MonkeyPatch, command: str, answer: object
+) -> None:
+    through(monkeypatch, *(httpx.Response(200, json=answer) for _ in range(3)))
+    with pytest.raises(ApiError, match=rf"than loopwright {version('loopwright')} reads, first at .*/docs"):
+        app(shlex.split(command), standalone_mode=False)
 
 
 def test_pages_are_lists(monkeypatch: pytest.MonkeyPatch) -> None:
