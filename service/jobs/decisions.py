@@ -17,7 +17,7 @@ from loopwright.service.states.loop_state import LoopState, gains_of, same_gains
 from loopwright.service.store import loop_locks, watches
 from loopwright.service.store.decision_requests import What
 from loopwright.service.store.jobs import Job
-from loopwright.service.store.store import Store
+from loopwright.service.store.store import Store, WithJob
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Ended, Reason
@@ -67,7 +67,7 @@ class Decisions:
 
     def roll_back_accepted(self, job_id: str, by: str) -> Job:
         """Takes an accepted change back, without a person, where the controller still has the accepted gains in
-        automatic.
+        automatic. The watch that has found trouble ends with it, in one transaction.
 
         Raises as `rollback` does, Conflict also where the loop is not as it was accepted.
         """
@@ -80,7 +80,7 @@ class Decisions:
                 return "another tuner has gains on trial"
             return None if same_gains(state.gains, accepted) else f"the controller holds {state.gains}: set by others"
 
-        return self._decide(job_id, JobState.ROLLED_BACK, by, objection)
+        return self._decide(job_id, JobState.ROLLED_BACK, by, objection, rolled_back=watches.put_back)
 
     def _decide(
         self,
@@ -89,6 +89,7 @@ class Decisions:
         by: str,
         objection: Callable[[LoopState], str | None] = lambda state: None,
         roll_back_by_itself: bool = True,
+        rolled_back: WithJob = watches.rolled_back,
     ) -> Job:
         row = self.store.get(job_id)
         with self._directory.alone_with(row.loop):
@@ -137,7 +138,7 @@ class Decisions:
             finally:
                 self._writes.pop(row.loop, None)
                 over.set()
-            also = watches.rolled_back if wanted is JobState.ROLLED_BACK else watched(by, roll_back_by_itself, config)
+            also = rolled_back if wanted is JobState.ROLLED_BACK else watched(by, roll_back_by_itself, config)
             decided = self.store.move(job_id, wanted, by=by, also=also, restored=state_json(state))
             if wanted is JobState.ACCEPTED:
                 self._knowledge.accepted(decided)

@@ -288,11 +288,9 @@ class Watching:
             why = error.detail if isinstance(error, Ended) else str(error)
             log.error("the old gains of %s could not be put back: %s", job.loop, why)
             self._not_put_back(job.id, why)
-        else:
-            watches.settle(self._store, job.id, partial(_settled, put_back=True, why_not=None))
 
     def _not_put_back(self, job_id: str, why: str) -> None:
-        watches.settle(self._store, job_id, partial(_settled, put_back=False, why_not=why))
+        watches.settle(self._store, job_id, partial(watches.settled, put_back=False, why_not=why))
 
     def _end(self, job_id: str, why: WatchEnd) -> None:
         log.info("the watch of job %s has ended: %s", job_id, why)
@@ -305,11 +303,6 @@ def _utc(at_s: float) -> datetime:
 
 def _with(watch: AcceptanceWatch, **fields: object) -> AcceptanceWatch:
     return watch.model_copy(update=fields)
-
-
-def _settled(watch: AcceptanceWatch, put_back: bool, why_not: str | None) -> AcceptanceWatch:
-    assert watch.trouble is not None
-    return _with(watch, trouble=watch.trouble.model_copy(update={"put_back": put_back, "why_not": why_not}))
 
 
 def _state(job: Job) -> LoopState:

@@ -50,6 +50,20 @@ def rolled_back(session: Session, job: JobRow) -> None:
         row.abnormal = False
 
 
+def put_back(session: Session, job: JobRow) -> None:
+    """As `rolled_back`, for the rollback of a watch by itself, which nobody has seen."""
+    row = session.get(WatchRow, job.id)
+    if row is not None:
+        _set(row, ended(settled(row.watch, put_back=True, why_not=None), WatchEnd.ROLLED_BACK))
+
+
+def settled(watch: AcceptanceWatch, put_back: bool, why_not: str | None) -> AcceptanceWatch:
+    """The watch, which has found trouble, with what was done about it."""
+    assert watch.trouble is not None
+    trouble = watch.trouble.model_copy(update={"put_back": put_back, "why_not": why_not})
+    return watch.model_copy(update={"trouble": trouble})
+
+
 def ended(watch: AcceptanceWatch, why: WatchEnd) -> AcceptanceWatch:
     """The watch, ended now."""
     return watch.model_copy(update={"end": why, "ended_at": now()})

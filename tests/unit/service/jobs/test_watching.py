@@ -9,17 +9,20 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy.exc import OperationalError
 
 from loopwright.plantsim.catalogue import LaterPath
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.states.acceptance_watch import TroubleKind, WatchEnd
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store import audit, job_knowledge
+from loopwright.service.store.jobs import Job
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.operation.model_conclusion import ModelState
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
+from tests.unit.service.jobs.test_lost_answers import LosesAnswers
 from tests.unit.service.jobs.watched import PU, TS, WatchedLoop
 
 CHANGES = (1.0, -1.0, 1.5)
@@ -352,6 +355,30 @@ def test_what_a_service_has_left_half_done_is_not_tried_again(
     assert trouble is not None and trouble.put_back is False
     assert "the service ended, or could not write it down" in str(trouble.why_not)
     assert service.controller.state.gains == NEW
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_what_is_known_of_a_rollback_whose_answer_is_lost(
+    service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch, kept: bool
+) -> None:
+    """The old gains are in effect; whether that was stored is told by the job."""
+    here = WatchedLoop(service, factor=unstable_from(5.0))
+    here.accept()
+    answers, move = LosesAnswers(service.store, monkeypatch), service.store.move
+
+    def moves(*asked: Any, **columns: Any) -> Job:
+        answers.lose_next(kept)
+        return move(*asked, **columns)
+
+    monkeypatch.setattr(service.store, "move", moves)
+    with pytest.raises(OperationalError):
+        here.goes_on(20.0, 1.0)
+    monkeypatch.undo()
+    here.goes_on(1.0)
+    trouble = here.watch.trouble
+    assert service.controller.state.gains == OLD and answers.lost and trouble is not None
+    assert (service.store.get(here.job_id).state, trouble.put_back) == ("rolled_back" if kept else "accepted", kept)
+    alarms(client, "rolled_back" if kept else "suspect_gains")
 
 
 def test_gains_that_somebody_else_has_set_end_the_watch(service: Service) -> None:
