@@ -136,6 +136,9 @@ class Fleet:
         self._over = threading.Event()
         self._aborted: set[str] = set()
         """Ids of the retunes whose abort the database did not take at once."""
+        self._unanswered: dict[str, bool] = {}
+        """Ids of the retunes whose request is not answered yet, and whether it was answered that it has failed: the
+        answer to the COMMIT alone may be lost."""
         self._looking = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
 
@@ -190,8 +193,16 @@ class Fleet:
         if wrong:
             raise BadFleet("; ".join(wrong))
         asked = {name: value for name, value in request.asked().items() if name != "loops"}
-        with self._store.writing() as session:
-            row = retunes.add(session, self._store.host, asked, tags, request.requested_by)
+        row: RetuneRow | None = None
+        try:
+            with self._store.writing() as session:
+                row = retunes.add(session, self._store.host, asked, tags, request.requested_by)
+                self._unanswered[row.id] = False
+        except BaseException:
+            if row is not None:
+                self._unanswered[row.id] = True
+            raise
+        del self._unanswered[row.id]
         self._wake.set()
         return row
 
@@ -262,12 +273,23 @@ class Fleet:
             for row in rows:
                 if row.stop_reason is None and row.id in self._aborted:  # its abort waits in the journal
                     continue
+                if not self._answered(row):
+                    continue
                 try:
                     self._one(*self.get(row.id))
                 except (FolderInUse, SQLAlchemyError):
                     raise
                 except Exception:  # the others go on
                     log.exception("a defect in the retune of many loops %s", row.id)
+
+    def _answered(self, row: RetuneRow) -> bool:
+        """Whether the retune may begin: not while its request is being stored, nor where it was answered that this has
+        failed, which stops it."""
+        failed = self._unanswered.get(row.id)
+        if failed:
+            self._stop(row, StopReason.SERVICE_STOPPED, "its request was answered with an error: ask anew")
+            del self._unanswered[row.id]
+        return failed is None
 
     def _one(self, row: RetuneRow, parts: list[Part]) -> None:
         if row.stop_reason is None:

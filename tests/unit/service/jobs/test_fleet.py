@@ -10,6 +10,7 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 from pydantic import ValidationError
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from loopwright.service.api.app import create_app
@@ -36,6 +37,7 @@ from tests.unit.service.fakes import (
     fake_rehearse,
     loop_entry,
 )
+from tests.unit.service.jobs.test_lost_answers import LosesAnswers
 from tests.unit.service.postgres import Server
 from tests.unit.service.processes import PATIENCE_S, until
 
@@ -560,6 +562,33 @@ def test_unknown(plant: Plant) -> None:
 
 def reasons(plant: Plant) -> list[Reason | None]:
     return [running.stop_reason for running in plant.jobs.registry.running.copy().values()]
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_request_that_was_answered_with_an_error_begins_nothing(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch, kept: bool
+) -> None:
+    """Also while the answer to its COMMIT is awaited."""
+    answers = LosesAnswers(plant.store, monkeypatch)
+    lose = answers.lose
+
+    def lost() -> None:
+        plant.fleet.poll()
+        lose()
+
+    monkeypatch.setattr(answers, "lose", lost)
+    answers.lose_next(kept)
+    with pytest.raises(OperationalError):
+        plant.fleet.start(asked(pattern="*"))
+    assert answers.lost
+    for _ in range(2):
+        plant.fleet.poll()
+    assert not plant.store.recent()
+    shown = [(row.state, row.detail) for row, _ in plant.fleet.recent(10)]
+    assert shown == ([("stopped", "its request was answered with an error: ask anew")] if kept else [])
+    plant.fleet.start(asked(pattern="*"))
+    plant.fleet.poll()
+    assert plant.store.recent()
 
 
 def test_an_abort_that_the_database_does_not_take_is_heard_at_once_and_kept(

@@ -49,12 +49,12 @@ class LosesAnswers:
             yield session
             kept, self._next = self._next, None
             if kept is False:
-                self._lose()
+                self.lose()
         if kept:
-            self._lose()
+            self.lose()
 
     @staticmethod
-    def _lose() -> None:
+    def lose() -> None:
         raise OperationalError("COMMIT", {}, Exception("server closed the connection unexpectedly"))
 
 
