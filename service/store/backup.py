@@ -15,7 +15,7 @@ from alembic.script import ScriptDirectory
 
 from loopwright.protocol.durable import put_in_place, sync
 from loopwright.service.store.database import FILE
-from loopwright.service.store.lock import FolderLock
+from loopwright.service.store.lock import LOCK, FolderLock
 from loopwright.service.store.store import Store
 
 
@@ -39,6 +39,8 @@ def back_up(data: Path, target: Path, replace: bool = False) -> int:
             f"{target} is in the data folder {data}, or a link to a file there: a back-up would take the place of what "
             "the service writes; name a file elsewhere"
         )
+    if target.exists() and (target.resolve().parent / LOCK).exists():
+        raise BackupProblem(f"{target} is a file of another service's data folder: name a file elsewhere")
     if target.exists() and not replace:
         raise BackupProblem(f"{target} exists already; --replace writes over it")
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".backup-") as folder:
@@ -68,7 +70,7 @@ def restore(source: Path, data: Path, replace: bool = False) -> tuple[int, Path 
     data.mkdir(mode=0o700, parents=True, exist_ok=True)
     # Held to the end: a service that starts meanwhile must not open half of it.
     with closing(FolderLock(data)), tempfile.TemporaryDirectory(dir=data, prefix=".restore-") as name:
-        there = [path for path in sorted(data.iterdir()) if path.is_file() and path.name != "lock"]
+        there = [path for path in sorted(data.iterdir()) if path.is_file() and path.name != LOCK]
         if there and not replace:
             raise BackupProblem(f"{data} has a database already; --replace keeps it aside and takes the back-up")
         made = Path(name)

@@ -22,6 +22,8 @@ CHECK_S = 1.0
 PATIENCE_S = 10.0
 """So long whoever has a name may take to come for it: a check, and a connection that is not answered in between."""
 _LOOK_S = 0.25
+LOCK = "lock"
+"""The file of a data folder that its service holds while it runs."""
 
 
 class FolderInUse(Exception):
@@ -34,10 +36,10 @@ def ourselves() -> str:
 
 
 class FolderLock:
-    """An exclusive lock on FOLDER/lock, whose text says who holds it. The system frees it when the process ends."""
+    """An exclusive lock on the file LOCK of a folder, whose text says who holds it. The system frees it as that ends."""
 
     def __init__(self, folder: Path) -> None:
-        self._file = open(folder / "lock", "a+")  # noqa: SIM115 - held until close
+        self._file = open(folder / LOCK, "a+")  # noqa: SIM115 - held until close
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

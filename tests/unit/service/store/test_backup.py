@@ -163,9 +163,16 @@ def _by_a_hard_link(data: Path, elsewhere: Path) -> Path:
     return elsewhere / "link"
 
 
+def _of_another_service(data: Path, elsewhere: Path) -> Path:
+    Store(elsewhere / "other").close()
+    return elsewhere / "other" / "loopwright.sqlite"
+
+
 @pytest.mark.parametrize(
-    "where", [_in_the_folder, _of_the_engine, _through_a_link_to_the_folder, _by_a_symlink, _by_a_hard_link]
-)
+    "where",
+    [_in_the_folder, _of_the_engine, _through_a_link_to_the_folder, _by_a_symlink, _by_a_hard_link,
+     _of_another_service],
+)  # fmt: skip
 @pytest.mark.parametrize("replace", [False, True])
 def test_a_back_up_does_not_take_the_place_of_what_the_service_writes(
     data: Path, tmp_path: Path, where: Any, replace: bool
