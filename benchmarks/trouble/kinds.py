@@ -89,6 +89,9 @@ def two_sides() -> Iterator[Trouble]:
         for at in (1, 2, 4):
             made = build(before=_alone(valves.broken, at, 1.0, above))
             yield Trouble("kinked valve", f"gain {above:g} from {at:g} % above rest on", made)
+    for at_10 in (1.3, 1.6, 2.5, 0.6):
+        made = build(before=_alone(valves.steeper_both_ways, at_10))
+        yield Trouble("gain changes alike to both sides", f"{at_10:g} at 10 % MV", made)
     for slope in (1.5, 2, 3):
         made = build(after=_alone(valves.steep_middle, slope, 1.0, 0.0))
         yield Trouble("steep middle (pH)", f"{slope:g} times as steep within 1 % PV", made)
@@ -136,6 +139,10 @@ def shapes() -> Iterator[Trouble]:
     for frequency, damping in ((3.0, 0.1), (5.0, 0.05)):
         of = partial(plants.resonant, frequency=frequency, damping=damping)
         yield Trouble("resonance", f"at {frequency:g} ultimate frequencies, damping {damping:g}", build(), of)
+    of = partial(plants.resonant, frequency=8.0, damping=0.01)
+    for noise in (NOISE, 0.03):
+        level = _noisy("at 8 ultimate frequencies, damping 0.01", noise)
+        yield Trouble("resonance", level, build(), of, noise=noise)
     for frequency in (0.3, 0.6, 1.0):
         of = partial(plants.antiresonant, frequency=frequency, damping=0.05, apart=1.15)
         yield Trouble("lightly damped mode", f"at {frequency:g} ultimate frequencies, damping 0.05", build(), of)

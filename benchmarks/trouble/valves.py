@@ -116,6 +116,17 @@ def root(opening: float) -> Characteristic:
     return Characteristic(curve, lambda low, high: [slope(low), slope(high)])
 
 
+def steeper_both_ways(at_10: float) -> Characteristic:
+    """Gain 1 at rest, and so many times that 10 % from rest, on either side."""
+
+    def slope(value: float) -> float:
+        return 1.0 + (at_10 - 1.0) * (value / 10.0) ** 2
+
+    return Characteristic(
+        lambda value: value * (2.0 + slope(value)) / 3.0, lambda low, high: [1.0, slope(low), slope(high)]
+    )
+
+
 def steep_middle(slope: float, width: float, off: float) -> Characteristic:
     """Of a titration: so steep within `width` of its middle, 1 outside; rest is `off` from the middle."""
 

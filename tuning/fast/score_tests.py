@@ -58,6 +58,11 @@ def squared(record: ExperimentRecord) -> Reals:
     return np.asarray(np.square(record.u) / record.input_range)
 
 
+def cubed(record: ExperimentRecord) -> Reals:
+    """MV times the square of its part of its largest deviation, MV units, shape (N,)."""
+    return np.asarray(record.u**3 / record.input_range**2)
+
+
 def fading(record: ExperimentRecord) -> Reals:
     """MV times a factor that grows from 0 at the end of the rest to 1 at the end of the record, shape (N,)."""
     grown = np.clip(np.arange(len(record.u)) - record.listened, 0.0, None)
@@ -222,6 +227,11 @@ def _curve(size: float) -> str:
     return f"the plant's gain changes by {200.0 * size:+.0f} % from the operating point to the largest MV"
 
 
+def _both_ways(size: float) -> str:
+    percent = max(300.0 * size, -100.0)
+    return f"the plant's gain changes by {percent:+.0f} % from the operating point to the largest MV, both ways"
+
+
 def _fading(size: float) -> str:
     return f"the plant's gain changes by {100.0 * size:+.0f} % in the course of the test"
 
@@ -262,7 +272,11 @@ def _pv_far(size: float) -> str:
 
 
 CHANGING_WITH_MV = (GainAlternative(above_rest, 0.05, _sides), GainAlternative(squared, 0.03, _curve))
-ALTERNATIVES = (*CHANGING_WITH_MV, GainAlternative(fading, 0.1, _fading))
+ALTERNATIVES = (
+    *CHANGING_WITH_MV,
+    GainAlternative(cubed, 0.03, _both_ways),
+    GainAlternative(fading, 0.1, _fading),
+)
 CHANGING_WITH_PV = (
     GainAlternative(pv_above_rest, 0.05, _pv_sides),
     GainAlternative(pv_far_above, 0.1, _pv_far),

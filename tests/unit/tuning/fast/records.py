@@ -98,13 +98,14 @@ def pulse_record(
     periods: float = 3.0,
     load_lasts: float = math.inf,
     changed: float = 1.0,
+    cubic: float = 0.0,
 ) -> ExperimentRecord:
     """Pulses of the set-point by 1 up, down and up, turned after 0.7 and 1.7 ultimate periods, over three periods.
 
     below: the plant's gain below rest, as a part of that above.  end: the gain at the end over that at rest.
     share, later: a second path, a part of the first one, ultimate periods later.  load: MV units, 1.3 periods
     before the end, for so many periods.  periods: the length of the test.  changed: the gain from the last turn on,
-    which is the record's step, over that before.
+    which is the record's step, over that before.  cubic: MV moves the plant as MV (1 + cubic MV^2) would.
     """
     plant = LinearPlant(bench.num, bench.den, bench.L, bench.Ts, noise_std=noise, seed=seed)
     channel = Channel(bench.Ts, Settings(-50.0, 50.0, 0.0), Parameters(Kp, Ti), 0.0, Mode.AUTOMATIC)
@@ -119,7 +120,7 @@ def pulse_record(
         u.append(channel.step(y[-1]))
         gain = 1.0 + (end - 1.0) * max(k - LISTENED, 0) / (samples - LISTENED)
         gain *= changed if k >= step else 1.0
-        moved = u[-1] if u[-1] > 0.0 else below * u[-1]
+        moved = (u[-1] if u[-1] > 0.0 else below * u[-1]) * (1.0 + cubic * u[-1] ** 2)
         before = k - round(later * period)
         plant.step(gain * moved + (share * u[before] if share and before >= 0 else 0.0))
     at, pv = np.array(u), np.array(y)

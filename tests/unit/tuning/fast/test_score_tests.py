@@ -13,6 +13,7 @@ from loopwright.tuning.fast.score_tests import (
     CHANGING_WITH_PV,
     ScoreTests,
     above_rest,
+    cubed,
     fading,
     late,
     pv_above_rest,
@@ -34,7 +35,7 @@ def test_a_linear_plant_is_not_told_to_be_another(name: str, seed: int) -> None:
     fit = Fit(pulse_record(*LOOPS[name], noise=0.01, seed=seed))
     linearity = ScoreTests(fit, choose_structure(fit).best)
     assert linearity.nonlinearity() is None
-    for changed in (above_rest, squared):
+    for changed in (above_rest, squared, cubed):
         size, deviation = linearity.score(changed)
         assert abs(size) < 4.0 * deviation and deviation < 0.1
     for alternative in CHANGING_WITH_PV:
@@ -46,7 +47,7 @@ def test_many_alternatives_at_once_are_each_as_alone() -> None:
     given = pulse_record(*LOOPS["three lags"], noise=0.01)
     fit = Fit(given)
     tests = ScoreTests(fit, choose_structure(fit).best)
-    changes = (above_rest, squared, fading, late(20))
+    changes = (above_rest, squared, cubed, fading, late(20))
     sizes, deviations = tests.scores(np.array([each(given) for each in changes]))
     alone = np.array([tests.score(each) for each in changes])
     assert np.column_stack((sizes, deviations)) == pytest.approx(alone, rel=1e-9)
@@ -85,6 +86,23 @@ def test_the_size_is_that_of_the_plant() -> None:
     fit = Fit(pulse_record(bench, 1.0, 10.0, noise=0.001, below=0.97))
     size, deviation = ScoreTests(fit, choose_structure(fit).best).score(above_rest)
     assert size == pytest.approx(0.03, abs=4.0 * deviation + 0.01)
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_gain_that_grows_alike_to_both_sides_is_seen_with_its_size(name: str) -> None:
+    """For a small growth the fit hardly bends: the score is then the growth itself."""
+    fit = Fit(pulse_record(*LOOPS[name], noise=0.001, cubic=0.01))
+    size, deviation = ScoreTests(fit, choose_structure(fit).best).score(cubed)
+    assert size == pytest.approx(0.01 * fit.record.input_range**2, abs=4.0 * deviation + 0.01)
+
+
+@pytest.mark.parametrize(("name", "cubic"), [("first order", -0.1), ("first order", 0.3), ("three lags", 0.3)])
+def test_gains_for_a_plant_that_is_steeper_or_flatter_to_both_sides_are_not_proposed(name: str, cubic: float) -> None:
+    """Under more noise the record may not tell: docs/limits.md."""
+    evaluation = evaluate(pulse_record(*LOOPS[name], noise=0.002, cubic=cubic), DesignSpec(1.6))
+    assert evaluation.reason is Reason.UNEXPLAINED
+    shown = ScoreTests(evaluation.fit, evaluation.chosen.best).nonlinearity()
+    assert shown is not None and "both ways" in shown.what and (shown.size > 0.0) == (cubic > 0.0)
 
 
 @pytest.mark.parametrize("end", [1.2, 1.3])
