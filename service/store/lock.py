@@ -36,7 +36,7 @@ def ourselves() -> str:
 
 
 class FolderLock:
-    """An exclusive lock on the file LOCK of a folder, whose text says who holds it. The system frees it as that ends."""
+    """An exclusive lock on the file LOCK of a folder, whose text says who has it. The system frees it as that ends."""
 
     def __init__(self, folder: Path) -> None:
         self._file = open(folder / LOCK, "a+")  # noqa: SIM115 - held until close
