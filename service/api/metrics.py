@@ -18,9 +18,10 @@ from loopwright.service.alarms.alarm import Level
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.states.job_state import ACTIVE, JobState, shown
 from loopwright.service.store import looked_after
+from loopwright.service.store.live_jobs import latest_tests
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow
-from loopwright.service.telemetry.metrics import OF_THIS_PROCESS
+from loopwright.service.telemetry.metrics import OF_THIS_PROCESS, SAMPLES_LOST
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
@@ -64,20 +65,22 @@ class _OfTheStore(Collector):
         yield retries
         up = GaugeMetricFamily("loopwright_database_up", "1: the database answers")
         try:
-            jobs, not_home = self._jobs(), self._not_home()
+            jobs, waiting, not_home = self._jobs(), self._waiting(), self._not_home()
         except SQLAlchemyError:
             up.add_metric([], 0)
         else:
             up.add_metric([], 1)
             yield jobs
+            yield waiting
             yield not_home
         yield up
 
     def _jobs(self) -> Metric:
         by = JobRow.state, JobRow.dry_run, JobRow.reason
         with Session(self._store.engine) as session:
-            counts = session.execute(select(*by, func.count()).group_by(*by)).all()
-        jobs = GaugeMetricFamily("loopwright_jobs", "Jobs in the database", labels=["state", "reason"])
+            own = JobRow.host == self._store.host  # gateways that share a database add up
+            counts = session.execute(select(*by, func.count()).where(own).group_by(*by)).all()
+        jobs = GaugeMetricFamily("loopwright_jobs", "Jobs of this gateway in the database", labels=["state", "reason"])
         found: Tally[tuple[str, str]] = Tally()
         for state, dry_run, reason, count in counts:
             found[shown(state, dry_run).value, reason or ""] += count
@@ -85,6 +88,13 @@ class _OfTheStore(Collector):
         for key in sorted(found.keys() | {(state.value, "") for state in ACTIVE | {JobState.PROPOSED}}):
             jobs.add_metric(list(key), found.get(key, 0))
         return jobs
+
+    def _waiting(self) -> Metric:
+        """A proposal that a later test has followed does not wait any more."""
+        latest = [job for job in latest_tests(self._store).values() if job.host == self._store.host]
+        found = GaugeMetricFamily("loopwright_proposals_waiting", "Loops whose latest job waits for a decision")
+        found.add_metric([], sum(job.state is JobState.PROPOSED for job in latest))
+        return found
 
     def _not_home(self) -> Metric:
         with Session(self._store.engine) as session:
@@ -102,6 +112,8 @@ def registry(
 ) -> CollectorRegistry:
     """The registry of the metrics of a service. sdo_retries: SDO retries by bus, as counted in this process.
     alarms: returns the number of alarms by level, 0 included."""
+    for bus in {loop.bus for loop in loops.values()}:
+        SAMPLES_LOST.labels(bus)  # from 0 on: of a counter that begins with the first loss Prometheus sees none
     found = CollectorRegistry()
     for collector in (*OF_THIS_PROCESS, _Build(), _OfTheStore(loops, store, sdo_retries), _Alarms(alarms)):
         found.register(collector)

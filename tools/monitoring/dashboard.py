@@ -18,7 +18,7 @@ NOW: Panels = (
     ("Loops not confirmed home", "short", "sum(loopwright_loops_looked_after)", ""),
     ("Alarms of the worst level", "short", 'sum(loopwright_alarms{level="1"})', ""),
     ("Tests that run", "short", 'sum(loopwright_jobs{state="running"})', ""),
-    ("Proposals that wait", "short", 'sum(loopwright_jobs{state="proposed"})', ""),
+    ("Proposals that wait", "short", "sum(loopwright_proposals_waiting)", ""),
     ("Buses that are heard", "short", "sum(loopwright_listening_up)", ""),
 )
 LOOPS: Panels = (

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
+from sqlalchemy import update
 from sqlalchemy.exc import OperationalError
 
 from loopwright.protocol.station import Station
@@ -20,13 +21,15 @@ from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
 from loopwright.service.api import operations
 from loopwright.service.api.app import create_app
 from loopwright.service.api.operations import Readiness
+from loopwright.service.inputs.config import parse_site
 from loopwright.service.loops.bus_watch import BusWatch
 from loopwright.service.server.serving import listen, tell_systemd
+from loopwright.service.store.tables import JobRow
 from loopwright.service.telemetry.logs import JsonLines, about
 from loopwright.service.telemetry.metrics import SAMPLES_LOST
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.api.test_api import finished, start
-from tests.unit.service.fakes import TAG, Service
+from tests.unit.service.fakes import TAG, FakeLoop, Service, loop_entry
 from tests.unit.service.processes import until
 
 
@@ -141,6 +144,33 @@ def test_loops_and_jobs_are_counted(service: Service, client: TestClient) -> Non
     assert found["loopwright_loops", (("bus", "virtual:test"),)] == 2
     jobs = {tuple(v for _, v in key[1]): n for key, n in found.items() if key[0] == "loopwright_jobs"}
     assert jobs == {("", "proposed"): 1, ("node_lost", "failed"): 1, ("", "running"): 1, ("", "queued"): 0}
+
+
+def test_a_proposal_that_a_later_test_has_followed_does_not_wait(service: Service, client: TestClient) -> None:
+    for _ in range(2):
+        finished(service, client)
+    found = samples(client)
+    assert found["loopwright_proposals_waiting", ()] == 1
+    assert found["loopwright_jobs", (("reason", ""), ("state", "proposed"))] == 2
+
+
+def test_the_jobs_of_another_gateway_are_counted_there(service: Service, client: TestClient) -> None:
+    """The sum over the gateways of a database has each job once."""
+    finished(service, client)
+    with service.store.writing() as session:
+        session.execute(update(JobRow).values(host="gw-2"))
+    found = samples(client)
+    assert found["loopwright_proposals_waiting", ()] == 0
+    assert found["loopwright_jobs", (("reason", ""), ("state", "proposed"))] == 0
+
+
+def test_samples_lost_are_counted_from_0_on(service: Service) -> None:
+    """Prometheus sees no increase in a counter that begins with the first loss."""
+    service.loops = parse_site({"loops": [loop_entry(bus="virtual:untouched")]}, "test").loops
+    jobs = service.more_jobs(lambda config: FakeLoop(service.controller))
+    found = samples(TestClient(create_app(jobs)))
+    assert found["loopwright_samples_lost_total", (("bus", "virtual:untouched"),)] == 0
+    jobs.stop()
 
 
 def test_stages_requests_and_samples_are_counted(service: Service, client: TestClient) -> None:
