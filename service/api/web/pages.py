@@ -42,9 +42,12 @@ HEADERS = {
 }
 
 
+_LOOPS = f"loops{os.sep}"
+
+
 class Pages(StaticFiles):
     """The files below a path. A path that is no file is a place within the page, and is answered with the page itself;
-    one that looks like a file and is none is 404."""
+    one that looks like a file and is none is 404, unless it names a loop, whose tag may have a dot in it."""
 
     def __init__(self) -> None:
         super().__init__(directory=FILES)
@@ -53,7 +56,7 @@ class Pages(StaticFiles):
         try:
             answer = await self._file("index.html" if path == "." else path, scope)
         except HTTPException as refused:
-            if refused.status_code != 404 or os.path.splitext(path)[1]:
+            if refused.status_code != 404 or (os.path.splitext(path)[1] and not path.startswith(_LOOPS)):
                 raise
             answer = await self._file("index.html", scope)
         answer.headers.update(HEADERS)

@@ -31,7 +31,12 @@ def client(service: Service) -> Iterator[TestClient]:
         yield client
 
 
-@pytest.mark.parametrize("path", ["/", "/ui", "/ui/", f"/ui/loops/{TAG}", "/ui/jobs/4f0c2a9be113", "/ui/index.html"])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/", "/ui", "/ui/", f"/ui/loops/{TAG}", "/ui/loops/10.FIC-101.js", "/ui/jobs/4f0c2a9be113", "/ui/index.html",
+    ],
+)  # fmt: skip
 def test_every_place_is_answered_with_the_page(client: TestClient, path: str) -> None:
     answer = client.get(path)
     assert answer.status_code == 200 and answer.headers["content-type"].startswith("text/html")
