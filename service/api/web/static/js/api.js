@@ -26,6 +26,14 @@ export const signedOut = signal(false);
 export const csrf = signal("");
 /** Counts answers that were 403: another key may have signed in, in another tab. */
 export const forbidden = signal(0);
+/**
+ * Counts commands that were not answered soon. A browser makes six connections to a service at most, for all of its
+ * windows, and the stream of each takes one: with six windows a command would wait in the browser for ever.
+ */
+export const crowded = signal(0);
+const SOON_MS = 1500;
+/** A command that is not answered for so long is taken back, if it is still in the browser: nothing begins later. */
+const LONGEST_S = 60;
 
 /** @param {string} method @param {string} path @param {unknown} [body] @param {AbortSignal} [stop] */
 async function request(method, path, body, stop) {
@@ -111,7 +119,21 @@ export async function askWith(path, body, stop) {
   return (await request("POST", path, body, stop)).found;
 }
 
-/** Sends a command, once. @param {string} path @param {unknown} [body] @param {string} [method] @returns {Promise<any>} */
-export async function command(path, body, method = "POST") {
-  return (await request(method, path, body)).found;
+/**
+ * Sends a command, once, and waits for the answer, not longer than `longest_s`.
+ * @param {string} path @param {unknown} [body] @param {string} [method] @param {number} [longest_s] @returns {Promise<any>}
+ */
+export async function command(path, body, method = "POST", longest_s = LONGEST_S) {
+  const stop = new AbortController();
+  const soon = setTimeout(() => crowded.value++, SOON_MS);
+  const late = setTimeout(() => stop.abort(), longest_s * 1000);
+  try {
+    return (await request(method, path, body, stop.signal)).found;
+  } catch (error) {
+    if (!stop.signal.aborted) throw error;
+    throw new Problem(0, { reason: "not_answered", detail: `The service has not answered within ${longest_s} s: it is not known whether it has heard this.` });
+  } finally {
+    clearTimeout(soon);
+    clearTimeout(late);
+  }
 }

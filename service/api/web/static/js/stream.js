@@ -1,7 +1,8 @@
 // @ts-check
 /** The one live stream of a page: opened anew with back-off, given up while the page is hidden. */
 import { batch } from "../vendor/signals-core.js";
-import { ask, signedOut } from "./api.js";
+import { forgetHeard } from "./aborting.js";
+import { ask, crowded, signedOut } from "./api.js";
 import {
   alarms, buses, jobs, newerVersion, now_s, clock_s, refreshLoops, service, setClock, silent_s, takeRows,
 } from "./state.js";
@@ -27,6 +28,8 @@ class Stream {
     /** @type {ReturnType<typeof setTimeout> | undefined} */
     this.hidden = undefined;
     this.given_up = false;
+    /** Whether the stream was away: another process of the service may answer, with other loops. */
+    this.away = false;
     this.jobs_seen = "";
     /** Counts how often the stream was opened. */
     this.opened = 0;
@@ -36,6 +39,10 @@ class Stream {
     this.open();
     setInterval(() => this.tick(), 500);
     document.addEventListener("visibilitychange", () => this.seen());
+    // A command that waits in the browser for a connection takes that of the stream, which waits behind it.
+    crowded.subscribe((count) => {
+      if (count && !this.given_up) this.open();
+    });
   }
 
   /** The loop whose samples and events are wanted. @param {string} tag @param {number} back_s @param {Listener} listener */
@@ -72,6 +79,9 @@ class Stream {
       if (service.value && service.value.version !== found.version) newerVersion.value = true;
       else service.value = { host: found.host, version: found.version };
       setClock(found.now_s);
+      if (!this.away) return;
+      this.away = false;
+      forgetHeard();
     });
     on("loops", (found) => {
       setClock(found.now_s);
@@ -102,6 +112,7 @@ class Stream {
   }
 
   later() {
+    this.away = true;
     this.tries++;
     const wait_s = Math.min(LONGEST_WAIT_S, 0.5 * 2 ** (this.tries - 1)) * (0.8 + 0.4 * Math.random());
     clearTimeout(this.retry);

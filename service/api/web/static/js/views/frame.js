@@ -1,7 +1,7 @@
 // @ts-check
 /** What stands on every view: the bar, the banner, the dock with Abort. */
 import { signal } from "../../vendor/signals-core.js";
-import { abortJob, aborting, abortError } from "../aborting.js";
+import { abortJob, abortError, stopWords } from "../aborting.js";
 import { abnormalNow } from "../alarms.js";
 import { command, signedOut } from "../api.js";
 import { html } from "../html.js";
@@ -83,10 +83,11 @@ export function Dock() {
 
 /** @param {{job: any, more: number}} props  more: tests that have no cell; nothing stands beside the button at the right. */
 function Cell({ job, more }) {
-  const stopping = job.stopping || aborting.value.has(job.id);
+  const stop = stopWords(job);
+  const stopping = stop !== "";
   const error = abortError.value.get(job.id);
   const left = isSilent.value ? "" : stopping ? "" : job.remaining_plant_time_s === null ? "" : `${duration(job.remaining_plant_time_s)} left`;
-  const stage = stopping ? "stopping, the loop is being restored" : job.state === "queued" ? "waits for its turn" : stageName(job.stage) || "begins";
+  const stage = stopping ? stop : job.state === "queued" ? "waits for its turn" : stageName(job.stage) || "begins";
   return html`<div class="cell">
     <a class="tag" href=${loopPath(job.loop)}>${job.loop}</a>
     <span class="stage" aria-live="polite">${stage}</span>

@@ -1,6 +1,7 @@
 // @ts-check
 /** Retunes of many loops: the list, one retune with its loops, the form. */
 import { useEffect, useState } from "../../vendor/hooks.js";
+import { notAborted, sendAbort } from "../aborting.js";
 import { ask, askPage, askWith, command } from "../api.js";
 import { html } from "../html.js";
 import { entered, ms, when } from "../numbers.js";
@@ -93,6 +94,7 @@ function One({ id }) {
   const [found, setFound] = useState(/** @type {any} */ (null));
   const [asking, setAsking] = useState(false);
   const [problem, setProblem] = useState("");
+  const [aborting, setAborting] = useState("");
   const mark = jobs.value.map((each) => `${each.id}${each.state}${each.stage}`).join();
   useEffect(() => {
     document.title = `Retune ${id} · Loopwright`;
@@ -109,14 +111,16 @@ function One({ id }) {
   const going = found.state === "running" || found.state === "stopping";
   const abort = async () => {
     setAsking(false);
+    setAborting("Abort sent, no answer yet.");
     try {
-      setFound(await command(`${found.url}/abort`, { by: signature.value || "operators' page" }));
+      setFound(await sendAbort(found));
+      setAborting("");
     } catch (error) {
-      setProblem(/** @type {Error} */ (error).message);
+      setAborting(notAborted(/** @type {import("../api.js").Problem} */ (error)));
     }
   };
   return html`<div><div class="pagehead" key="head"><h1>Retune of ${found.loops.length} ${found.loops.length === 1 ? "loop" : "loops"}</h1><span class="quiet">${when(found.created_at)} · ${found.requested_by} · ${found.state}</span><span class="sentence">${countWords(found.counts)}</span></div>
-    ${found.detail && html`<p class="refusal" key="detail">${found.detail}</p>`}${problem && html`<p class="refusal" role="alert" key="problem">${problem}</p>`}
+    ${found.detail && html`<p class="refusal" key="detail">${found.detail}</p>`}${problem && html`<p class="refusal" role="alert" key="problem">${problem}</p>`}${aborting && html`<p class="refusal" role="alert" key="aborting">${aborting}</p>`}
     ${going && may.operate.value && html`<p class="foot" key="abort">${asking ? html`<span key="q">This ends the retune of all ${found.loops.length} loops.</span><button key="no" onClick=${() => setAsking(false)}>Go on</button><button key="yes" class="abort" onClick=${abort}>Abort all ${found.loops.length}</button>` : html`<button key="ask" class="abort" onClick=${() => setAsking(true)}>Abort all ${found.loops.length}…</button>`}</p>`}
     <div class="table" key="table"><table><thead><tr><th>Loop</th><th>State</th><th>Result</th><th>Job</th></tr></thead><tbody>
       ${found.loops.map((/** @type {any} */ each) => {

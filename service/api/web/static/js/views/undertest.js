@@ -4,15 +4,16 @@ import { html } from "../html.js";
 import { duration } from "../numbers.js";
 import { isSilent } from "../state.js";
 import { sentence, stageFound, stageName, stagesOf, stageWhat } from "../words.js";
-import { aborting } from "../aborting.js";
+import { stopWords } from "../aborting.js";
 import { Progress } from "./frame.js";
 
 /** @param {{loop: any, live: any, job: any}} props  live: of the stream; job: as read, null: not yet. */
 export function UnderTest({ loop, live, job }) {
-  const stopping = live.stopping || aborting.value.has(live.id);
+  const stop = stopWords(live);
+  const stopping = stop !== "";
   return html`<section class="card undertest" aria-label="Under test">
     <div class="split" key="top"><h2 class="title">${live.state === "queued" ? "Waits for its turn" : "Under test"}</h2>
-      <span>${stopping ? "stopping, the loop is being restored" : live.remaining_plant_time_s !== null && !isSilent.value ? html`about <b>${duration(live.remaining_plant_time_s)}</b> left <span class="quiet">of plant time, ${duration(live.plant_time_s)} so far</span>` : ""}</span></div>
+      <span>${stopping ? stop : live.remaining_plant_time_s !== null && !isSilent.value ? html`about <b>${duration(live.remaining_plant_time_s)}</b> left <span class="quiet">of plant time, ${duration(live.plant_time_s)} so far</span>` : ""}</span></div>
     ${Progress(live.progress, stopping)}
     ${job ? Stages(job, loop.pv_unit, live.stage ?? "") : html`<p class="quiet" key="asking">Asking for the stages…</p>`}
     ${job?.attempts > 1 && html`<p class="note" key="resumed">Resumed after a restart of the service: the stages begin anew.</p>`}
