@@ -32,6 +32,8 @@ class LookedUpJobs:
         self._jobs, self._others = jobs, others
         self.live: list[JobInBrief] = []
         self.latest: dict[str, JobInBrief] = {}
+        self.locked: dict[str, str] = {}
+        """Since when a loop is locked, of the loops that are."""
         self.loops: list[tuple[str, str]] = [(tag, jobs.store.host) for tag in jobs.directory.loops]
         """Tag and host of every loop."""
         self._followed: dict[str, _Followed] = {}
@@ -40,11 +42,12 @@ class LookedUpJobs:
         """Asks the database. Raises SQLAlchemyError.
 
         watched: loops whose events are wanted.
-        thoroughly: whether the latest jobs and the loops of other hosts are asked for too.
+        thoroughly: whether the latest jobs, the locks and the loops of other hosts are asked for too.
         """
         store = self._jobs.store
         if thoroughly:
             self._others.look()
+            self.locked = {tag: row.since for tag, row in self._jobs.locking.locks().items()}
         live = live_jobs(store)
         if thoroughly or {job.id for job in live} != {job.id for job in self.live}:
             self.latest = latest_jobs(store)

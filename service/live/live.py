@@ -225,13 +225,14 @@ class Live:
         rows = []
         for tag, host in found.loops:
             job = job_of.get(tag)
+            last, locked = found.latest.get(tag), found.locked.get(tag)
             if host != self._jobs.store.host:
-                rows.append(with_jobs(self._others.values(tag, host), host, job, found.latest.get(tag)))
+                rows.append(with_jobs(self._others.values(tag, host), host, job, last, locked))
                 continue
             running = None if job is None else self._jobs.running(job.id)
             held = running.loop.latest if running is not None and running.loop is not None else None
             deaf = self._listening.why_not_heard(tag)
-            rows.append(loop_row(tag, host, LiveFacts(heard.get(tag), deaf, held, job, found.latest.get(tag)), now_s))
+            rows.append(loop_row(tag, host, LiveFacts(heard.get(tag), deaf, held, job, last, locked), now_s))
         self._show("loops", event("loops", Loops(now_s=round(now_s, 3), loops=rows)))
         self._show("buses", event("buses", Buses(buses=[*self._own.buses(), *self._others.buses()])))
 

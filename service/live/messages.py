@@ -64,6 +64,9 @@ class LiveLoopRow(LoopValues):
     host: str = Field(description="The gateway that has the loop")
     job: str | None = Field(description="URL of the job that has the loop")
     last_job: LastJob | None
+    locked_since: str | None = Field(
+        default=None, description="Since when the loop is locked: UTC, ISO 8601, wall time; null: it is not"
+    )
 
 
 class Loops(BaseModel):

@@ -25,6 +25,7 @@ class LiveFacts:
     deaf: why its bus is not heard; None: it is.
     held: the state that the running job of this service has; None: no such job has read the loop.
     job, last_job: the job that has the loop, and the latest one.
+    locked_since: since when somebody has locked the loop; None: it is not locked.
     """
 
     heard: Heard | None = None
@@ -32,20 +33,24 @@ class LiveFacts:
     held: LoopState | None = None
     job: JobInBrief | None = None
     last_job: JobInBrief | None = None
+    locked_since: str | None = None
 
 
 def loop_row(tag: str, host: str, known: LiveFacts, now_s: float) -> LiveLoopRow:
     """Returns the row of a loop of this host."""
-    return with_jobs(loop_values(tag, known, now_s), host, known.job, known.last_job)
+    return with_jobs(loop_values(tag, known, now_s), host, known.job, known.last_job, known.locked_since)
 
 
-def with_jobs(values: LoopValues, host: str, job: JobInBrief | None, last_job: JobInBrief | None) -> LiveLoopRow:
+def with_jobs(
+    values: LoopValues, host: str, job: JobInBrief | None, last_job: JobInBrief | None, locked_since: str | None = None
+) -> LiveLoopRow:
     """Returns the row of a loop with these values."""
     return LiveLoopRow(
         **dict(values),
         host=host,
         job=None if job is None else f"/jobs/{job.id}",
         last_job=None if last_job is None else LastJob(url=f"/jobs/{last_job.id}", state=last_job.state),
+        locked_since=locked_since,
     )
 
 

@@ -5,19 +5,24 @@ The loop and its controller are simulated; the API behind the page is the real o
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
-from playwright.sync_api import Route, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from loopwright.service.api.app import create_app
+from loopwright.service.inputs.config import parse_site
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.live.messages import RETRY_MS
+from loopwright.tuning.reasons import Failed, Reason
 from tests.browser import person
 from tests.browser.pages import Pages
-from tests.unit.service.fakes import TAG, Service
+from tests.browser.test_clock import HIDE
+from tests.unit.service.fakes import TAG, FakeLoop, Service, loop_entry
 from tests.unit.service.processes import until
 from tests.unit.service.served import served
 
@@ -47,6 +52,42 @@ def proposal(service: Service, tag: str = TAG) -> str:
     job_id = service.jobs.start(tag, FastRetune(requested_by=person.NAME)).id
     service.wait(job_id)
     return job_id
+
+
+def stream(**said: Any) -> str:
+    """A live stream that says this and ends."""
+    return f"retry: {RETRY_MS}\n" + "".join(
+        f"event: {name}\ndata: {json.dumps(data)}\n\n" for name, data in said.items()
+    )
+
+
+class TestWhatOthersDo:
+    def test_a_lock_and_its_end_are_seen(self, site: SimulatedSite, pages: Pages) -> None:
+        proposal(site.service)
+        page = pages.open(LOOP)
+        accept = page.get_by_role("button", name="Accept the new gains")
+        expect(accept).to_be_enabled()
+        site.service.jobs.locking.lock(TAG, "valve is being overhauled", "night shift")
+        expect(page.get_by_text("Locked by night shift since")).to_be_visible()
+        expect(accept).not_to_be_attached()
+        site.service.jobs.locking.unlock(TAG, "night shift")
+        expect(accept).to_be_enabled()
+
+    def test_what_was_known_before_a_later_test_is_not_shown_as_known_now(
+        self, site: SimulatedSite, pages: Pages
+    ) -> None:
+        page = pages.open(LOOP)
+        known = page.get_by_role("region", name="What is known of the plant")
+        found = {
+            "knowledge": {"Ms": 1.61, "uncertainty": 0.02, "model": {"dead_time_s": 2.0}, "changes": 3, "agreeing": 0,
+                          "text": "Ms known"},
+            "known": "", "detail": "", "advice": None, "changes_used": [], "changes_dropped": [], "loads": [],
+        }  # fmt: skip
+        page.route("**/observation", lambda route: route.fulfill(json=found))
+        page.get_by_role("button", name="Look at normal operation").click()
+        expect(known).to_contain_text("1.61")
+        proposal(site.service)
+        expect(known).not_to_contain_text("1.61")
 
 
 class TestAbort:
@@ -91,10 +132,7 @@ class TestAbort:
             "remaining_plant_time_s": None, "plant_time_s": 0.0, "stopping": True,
         }  # fmt: skip
         hello = {"host": "local", "version": "0.1.0", "now_s": 1769860830.5, "loops": [], "back_s": 10.0}
-        said = {"hello": hello, "jobs": {"jobs": [job]}}
-        text = f"retry: {RETRY_MS}\n" + "".join(
-            f"event: {name}\ndata: {json.dumps(data)}\n\n" for name, data in said.items()
-        )
+        text = stream(hello=hello, jobs={"jobs": [job]})
         page = pages.open("/ui/jobs")
         page.route("**/live*", lambda route: route.fulfill(body=text, content_type="text/event-stream"))
         page.reload()
@@ -120,6 +158,91 @@ class TestAbort:
         page.route("**/session", lambda route: route.fulfill(json=session))
         with pages.expecting("status of 403"):
             person.abort_button(page).click()
-        running = site.service.jobs.running(job_id)
-        until(lambda: running is None or running.stop_reason is not None, "the abort")
+            expect(person.dock(page)).not_to_be_attached()
         assert shown == [None, "of the new session"]
+        assert site.service.store.get(job_id).reason is Reason.OPERATOR
+
+
+class TestStream:
+    def test_a_service_that_comes_back_with_other_limits(self, tmp_path: Path, browser: Browser) -> None:
+        service = Service(tmp_path)
+        with served(create_app(service.jobs)) as server:
+            pages = Pages(browser, f"http://127.0.0.1:{server.port}")
+            page = pages.open(LOOP)
+            settings = page.get_by_role("region", name="Gains and limits")
+            expect(settings).to_contain_text("0.0 … 100.0")
+        service.jobs.stop()
+        entries = [loop_entry(pv_limits={"low": 10.0, "high": 77.0}), loop_entry(tag=OTHER, channel=2)]
+        service.loops = parse_site({"loops": entries}, "test").loops
+        jobs = service.more_jobs(lambda config: FakeLoop(service.controller))
+        with served(create_app(jobs), port=server.port):
+            expect(settings).to_contain_text("10.00 … 77.00")
+            pages.close()
+        jobs.stop()
+        service.store.close()
+
+    def test_a_connection_that_is_dead_is_made_anew(self, site: SimulatedSite, pages: Pages) -> None:
+        """A stream that never says anything again, and never ends, as of a gateway that has lost its power."""
+        page = pages.open("/ui/")
+        held: list[Route] = []
+        page.route("**/live*", lambda route: held.append(route) if not held else route.continue_())
+        page.reload()
+        banner = ".banner[role=alert]"
+        person.remember(page, banner)
+        until(lambda: len(person.remembered(page)) > 0, "the banner")
+        assert held and "No word from the service" in person.remembered(page)[0]
+        expect(page.locator(banner)).not_to_be_attached()
+
+    def test_what_was_heard_before_a_page_was_hidden_is_not_shown_as_present(
+        self, site: SimulatedSite, pages: Pages
+    ) -> None:
+        context = pages.context()
+        context.clock.install()
+        values = {
+            "tag": TAG, "pv": 50.0, "sp": 50.0, "mv": 40.0, "mode": "automatic", "age_s": 0.1, "under_test": False,
+            "on_trial": False, "not_heard": None, "last": None, "host": "local", "job": None, "last_job": None,
+        }  # fmt: skip
+        now_s = time.time()
+        hello = {"host": "local", "version": "0.1.0", "now_s": now_s, "loops": [TAG], "back_s": 10.0}
+        text = stream(hello=hello, loops={"now_s": now_s, "loops": [values]})
+        context.route("**/live*", lambda route: route.fulfill(body=text, content_type="text/event-stream"))
+        page = pages.another(context, LOOP)
+        pv = person.face(page).locator(".big")
+        expect(pv).to_have_text("50.0")
+        page.evaluate(HIDE, True)
+        page.clock.fast_forward("01:05")
+        context.unroute("**/live*")
+        context.route("**/live*", lambda route: None)
+        page.evaluate(HIDE, False)
+        page.clock.run_for(600)  # less than what is a silence
+        assert pv.text_content() == person.DASH
+
+    def test_the_count_of_what_is_abnormal_goes_on_in_a_tab_that_nobody_sees(
+        self, site: SimulatedSite, pages: Pages
+    ) -> None:
+        context = pages.context()
+        context.clock.install()
+        page = pages.another(context, "/ui/alarms")
+        expect(page.get_by_text("Nothing is abnormal.")).to_be_visible()
+        page.evaluate(HIDE, True)
+        page.clock.fast_forward("01:05")
+        service = site.service
+        service.tune.ends = Failed(Reason.RESTORE_UNCONFIRMED, "the loop could not be read back")
+        service.wait(service.jobs.start(TAG, FastRetune()).id)
+        expect(page.get_by_role("main")).to_contain_text("Not confirmed that the loop is as before the test")
+        expect(page).to_have_title("(1) Loopwright")
+
+
+def test_a_trend_goes_on_when_the_clock_of_the_service_is_put_back(site: SimulatedSite, page: Page) -> None:
+    found = page.evaluate(
+        """async () => {
+          const { Ring } = await import("/ui/js/ring.js");
+          const ring = new Ring();
+          const take = (at, pv) =>
+            ring.take({ past: false, at_s: [at, at + 0.1], pv: [pv, pv], sp: [1, 1], mv: [1, 1], gap_before: [] });
+          for (const at of [1000, 1000.2, 5000, 5000.2]) take(at, 1);
+          for (const at of [1400, 1400.2]) take(at, 2);
+          return [...ring.since(0).pv].map((each) => (Number.isNaN(each) ? null : each));
+        }"""
+    )
+    assert found == [1, 1, 1, 1, None, 2, 2, 2, 2]

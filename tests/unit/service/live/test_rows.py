@@ -40,6 +40,8 @@ def test_a_loop_that_is_heard() -> None:
     assert (row.pv, row.sp, row.mv, row.mode, row.age_s) == (49.9, 50.0, 41.2, "automatic", 0.06)
     assert (row.under_test, row.on_trial, row.not_heard, row.job) == (True, False, None, "/jobs/4f0c2a9be113")
     assert row.last_job is not None and row.last_job.state is JobState.RUNNING
+    assert row.locked_since is None
+    assert loop_row("A", "local", LiveFacts(HEARD, locked_since="2026-01-31T12:00:00.000Z"), T0).locked_since
 
 
 def test_what_is_not_known_is_null() -> None:

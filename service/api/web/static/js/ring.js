@@ -2,6 +2,8 @@
 /** The latest samples of one loop, in typed arrays which a plot takes as they are. A gap is a sample of NaN. */
 
 const ROOM = 40_000;
+/** Samples come in order: one that is earlier than the latest by more than this says that the service's clock was put back. */
+export const SET_BACK_S = 2;
 
 export class Ring {
   /** @param {number} room */
@@ -53,12 +55,19 @@ export class Ring {
     }
   }
 
+  /** The service's clock was put back: what it has called later is let go, or nothing would be drawn until then. @param {number} at */
+  setBack(at) {
+    while (this.length && this.at[this.end - 1] >= at) this.end--;
+    this.gap();
+  }
+
   /**
    * Takes a message `samples` of the live stream.
-   * @param {{at_s: number[], pv: (number|null)[], sp: (number|null)[], mv: (number|null)[], gap_before: number[]}} found
+   * @param {{past: boolean, at_s: number[], pv: (number|null)[], sp: (number|null)[], mv: (number|null)[], gap_before: number[]}} found
    */
   take(found) {
     const gaps = new Set(found.gap_before);
+    if (!found.past && found.at_s[0] < this.last - SET_BACK_S) this.setBack(found.at_s[0]);
     for (let n = 0; n < found.at_s.length; n++) {
       if (gaps.has(n)) this.gap();
       this.push(found.at_s[n], found.pv[n], found.sp[n], found.mv[n]);

@@ -29,6 +29,13 @@ export function takeRows(found) {
   });
 }
 
+/** What was heard of the loops is not known any more. */
+export function forgetRows() {
+  batch(() => {
+    for (const row of rows.values()) row.value = null;
+  });
+}
+
 export const buses = signal(/** @type {{host: string, bus: string, up: boolean | null, why: string | null}[]} */ ([]));
 /** Live jobs. */
 export const jobs = signal(/** @type {any[]} */ ([]));

@@ -4,10 +4,12 @@ import { batch } from "../vendor/signals-core.js";
 import { forgetHeard } from "./aborting.js";
 import { ask, crowded, signedOut } from "./api.js";
 import {
-  alarms, buses, jobs, newerVersion, now_s, clock_s, refreshLoops, service, setClock, silent_s, takeRows,
+  alarms, buses, forgetRows, jobs, newerVersion, now_s, clock_s, refreshLoops, service, setClock, silent_s, takeRows,
 } from "./state.js";
 
 const SILENT_S = 2.5;
+/** A stream that is open and has said nothing for so long is opened anew: its connection may be dead, which nobody says. */
+const DEAD_S = 10;
 const HIDDEN_S = 60;
 const LONGEST_WAIT_S = 15;
 
@@ -22,6 +24,7 @@ class Stream {
     /** @type {Set<Listener>} */
     this.listeners = new Set();
     this.heard_ms = performance.now();
+    this.opened_ms = performance.now();
     this.tries = 0;
     /** @type {ReturnType<typeof setTimeout> | undefined} */
     this.retry = undefined;
@@ -30,7 +33,10 @@ class Stream {
     this.given_up = false;
     /** Whether the stream was away: another process of the service may answer, with other loops. */
     this.away = false;
+    /** Whether it goes on while the page is hidden. */
+    this.stays = false;
     this.jobs_seen = "";
+    this.differing = "";
     /** Counts how often the stream was opened. */
     this.opened = 0;
   }
@@ -66,6 +72,7 @@ class Stream {
     this.source?.close();
     const query = this.tag ? `?loops=${encodeURIComponent(this.tag)}&back_s=${this.back_s}` : "";
     this.opened++;
+    this.opened_ms = performance.now();
     const source = new EventSource(`/live${query}`);
     this.source = source;
     /** @param {string} name @param {(found: any) => void} take */
@@ -82,11 +89,12 @@ class Stream {
       if (!this.away) return;
       this.away = false;
       forgetHeard();
+      void refreshLoops();
     });
     on("loops", (found) => {
       setClock(found.now_s);
       takeRows(found.loops);
-      const seen = found.loops.map((/** @type {any} */ row) => `${row.tag}${row.job}${row.last_job?.url}${row.last_job?.state}`).join();
+      const seen = found.loops.map((/** @type {any} */ row) => `${row.tag}${row.job}${row.last_job?.url}${row.last_job?.state}${row.locked_since}`).join();
       if (seen !== this.jobs_seen) {
         this.jobs_seen = seen;
         void refreshLoops();
@@ -94,7 +102,13 @@ class Stream {
     });
     on("buses", (found) => (buses.value = found.buses));
     on("jobs", (found) => (jobs.value = found.jobs));
-    on("alarms", (found) => (alarms.value = found.alarms));
+    on("alarms", (found) => {
+      alarms.value = found.alarms;
+      const differing = found.alarms.filter((/** @type {any} */ each) => each.kind === "gains_differ").map((/** @type {any} */ each) => each.id).join();
+      if (differing === this.differing) return;
+      this.differing = differing;
+      void refreshLoops();
+    });
     on("samples", (found) => this.listeners.forEach((each) => each.samples?.(found)));
     on("job", (found) => this.listeners.forEach((each) => each.job?.(found)));
     source.addEventListener("error", () => {
@@ -138,14 +152,23 @@ class Stream {
       now_s.value = Date.now() / 1000 + clock_s;
       if (!this.given_up) silent_s.value = quiet_s > SILENT_S ? Math.max(1, Math.floor(quiet_s)) : 0;
     });
+    const open_s = (performance.now() - this.opened_ms) / 1000;
+    if (!this.given_up && this.source && this.source.readyState !== EventSource.CLOSED && Math.min(quiet_s, open_s) > DEAD_S) {
+      this.away = true;
+      this.open();
+    }
   }
 
   seen() {
     clearTimeout(this.hidden);
     if (document.hidden) {
       this.hidden = setTimeout(() => {
+        if (this.stays) return;
         this.given_up = true;
+        this.away = true;
         this.source?.close();
+        clearTimeout(this.retry);
+        forgetRows(); // what is shown first when the page is seen again is not what was heard long ago
       }, HIDDEN_S * 1000);
     } else if (this.given_up) {
       this.given_up = false;

@@ -7,6 +7,7 @@ import { html } from "../html.js";
 import { duration, when } from "../numbers.js";
 import { jobPath, loopPath } from "../router.js";
 import { isSilent, loops, now_s } from "../state.js";
+import { stream } from "../stream.js";
 import { AlarmSymbol } from "../symbols.js";
 import { asking, SignOffButton, SignOffQuestion } from "./signoff.js";
 
@@ -24,8 +25,10 @@ export function AbnormalView() {
       }
     };
     void wake();
+    stream.stays = true; // the title counts, also where it is all that is seen of the page
     document.addEventListener("visibilitychange", wake);
     return () => {
+      stream.stays = false;
       document.removeEventListener("visibilitychange", wake);
       lock?.release();
     };

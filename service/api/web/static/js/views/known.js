@@ -1,6 +1,6 @@
 // @ts-check
 /** What is known of a loop's plant: from its tests, and from normal operation when asked. */
-import { useState } from "../../vendor/hooks.js";
+import { useEffect, useState } from "../../vendor/hooks.js";
 import { ask } from "../api.js";
 import { html } from "../html.js";
 import { known, ms, msError, significant, withUnit, when } from "../numbers.js";
@@ -9,6 +9,8 @@ import { known, ms, msError, significant, withUnit, when } from "../numbers.js";
 export function Known({ loop, detail }) {
   const [found, setFound] = useState(/** @type {any} */ (null));
   const [state, setState] = useState("");
+  // What was found is of the gains that were in effect then.
+  useEffect(() => setFound(null), [loop.last_job?.url, loop.last_job?.state, loop.gains_differ]);
   const look = async () => {
     setState("Looking at what was heard…");
     try {

@@ -8,7 +8,7 @@ import { html } from "../html.js";
 import { fixed, pvDecimals, timeOfDay, unit } from "../numbers.js";
 import { colour, shown } from "../palette.js";
 import { hatched, makePlot, mark, yRange } from "../plot.js";
-import { Ring } from "../ring.js";
+import { Ring, SET_BACK_S } from "../ring.js";
 import { isSilent, now_s, rowOf } from "../state.js";
 import { stream } from "../stream.js";
 import { stageName } from "../words.js";
@@ -187,7 +187,7 @@ export function Trend({ loop, job, height, onJob }) {
       if (!row || row.not_heard !== null || row.age_s === null || !isElsewhere(loop)) return;
       const at_s = now_s.peek() - row.age_s;
       const since_s = at_s - it.ring.last;
-      if (since_s < SAME_S) return;
+      if (since_s < SAME_S && since_s > -SET_BACK_S) return;
       listener.samples({ tag: loop.tag, past: false, at_s: [at_s], pv: [row.pv], sp: [row.sp], mv: [row.mv], gap_before: since_s > GAP_S ? [0] : [] });
     });
     const leave = stream.watch(loop.tag, 130, listener);
