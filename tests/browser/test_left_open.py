@@ -73,6 +73,13 @@ class TestWhatOthersDo:
         site.service.jobs.locking.unlock(TAG, "night shift")
         expect(accept).to_be_enabled()
 
+    def test_a_decision_is_seen_in_the_list_of_jobs(self, site: SimulatedSite, pages: Pages) -> None:
+        job_id = proposal(site.service)
+        page = pages.open("/ui/jobs")
+        expect(page.get_by_role("row", name=TAG)).to_contain_text("decision waits")
+        site.service.jobs.decisions.rollback(job_id, "B. Roth")
+        expect(page.get_by_role("row", name=TAG)).to_contain_text("B. Roth")
+
     def test_what_was_known_before_a_later_test_is_not_shown_as_known_now(
         self, site: SimulatedSite, pages: Pages
     ) -> None:
@@ -161,6 +168,28 @@ class TestAbort:
             expect(person.dock(page)).not_to_be_attached()
         assert shown == [None, "of the new session"]
         assert site.service.store.get(job_id).reason is Reason.OPERATOR
+
+
+class TestManyLoops:
+    def test_what_is_begun_is_what_was_announced(self, site: SimulatedSite, pages: Pages) -> None:
+        """Who types on and presses the button before the next announcement has come begins nothing."""
+        page = pages.open("/ui/retunes")
+        person.sign(page)
+        loops = page.get_by_label("Loops", exact=True)
+        loops.fill("TIC-*")
+        expect(page.get_by_role("button", name="Retune 1 loop")).to_be_enabled()
+        page.route("**/retunes/preview", lambda route: None)
+        loops.fill("*")
+        expect(page.get_by_role("button", name="Retune 1 loop")).to_be_disabled()
+
+    def test_a_field_that_is_no_number_is_not_left_out(self, site: SimulatedSite, pages: Pages) -> None:
+        page = pages.open("/ui/retunes")
+        person.sign(page)
+        page.get_by_label("Loops", exact=True).fill("*")
+        expect(page.get_by_role("button", name="Retune 2 loops")).to_be_enabled()
+        page.get_by_label("At once per bus").fill("1.5")
+        expect(page.get_by_role("button", name="Retune", exact=True)).to_be_disabled()
+        expect(page.get_by_role("region", name="Retune many loops")).to_contain_text("A field is not a whole number.")
 
 
 class TestStream:

@@ -1,6 +1,6 @@
 // @ts-check
 /** The jobs: what ran, who asked, what came of it, who decided. */
-import { useEffect, useState } from "../../vendor/hooks.js";
+import { useEffect, useRef, useState } from "../../vendor/hooks.js";
 import { askPage } from "../api.js";
 import { html } from "../html.js";
 import { known, ms, significant, when } from "../numbers.js";
@@ -8,6 +8,7 @@ import { go, jobPath, loopPath } from "../router.js";
 import { jobs as live, loops } from "../state.js";
 import { methodName, stageName, stateWords } from "../words.js";
 
+const [PAGE, MOST] = [50, 200];
 const STATES = ["", "proposed", "accepted", "rolled_back", "refused", "aborted", "failed", "interrupted", "no_gain", "rehearsed", "running", "queued"];
 
 export function JobsView() {
@@ -16,13 +17,18 @@ export function JobsView() {
   const [rows, setRows] = useState(/** @type {any[] | null} */ (null));
   const [next, setNext] = useState(/** @type {string | null} */ (null));
   const [problem, setProblem] = useState("");
-  const marks = `${live.value.map((each) => each.id + each.state).join()}`;
-  const path = `/jobs?limit=50${loop ? `&loop=${encodeURIComponent(loop)}` : ""}${state ? `&state=${state}` : ""}`;
+  // A decision of somebody else moves no live job, but the latest one of a loop.
+  const decided = [...(loops.value?.values() ?? [])].map((each) => `${each.last_job?.url}${each.last_job?.state}`).join();
+  const marks = `${live.value.map((each) => each.id + each.state).join()} ${decided}`;
+  const path = `/jobs?${loop ? `&loop=${encodeURIComponent(loop)}` : ""}${state ? `&state=${state}` : ""}&limit=`.replace("?&", "?");
+  const shown = useRef({ path, count: 0 }); // those that were asked for with More stay when something has changed
   useEffect(() => {
     document.title = "Jobs · Loopwright";
     const stop = new AbortController();
-    askPage(path, stop.signal).then(
+    const limit = shown.current.path === path ? Math.min(MOST, Math.max(PAGE, shown.current.count)) : PAGE;
+    askPage(`${path}${limit}`, stop.signal).then(
       (found) => {
+        shown.current = { path, count: found.entries.length };
         setRows(found.entries);
         setNext(found.next);
         setProblem("");
@@ -35,9 +41,15 @@ export function JobsView() {
   }, [path, marks]);
   const more = async () => {
     if (!next || !rows) return;
-    const found = await askPage(next);
-    setRows([...rows, ...found.entries]);
-    setNext(found.next);
+    try {
+      const found = await askPage(next);
+      if (shown.current.path !== path || shown.current.count !== rows.length) return; // the list is another one by now
+      shown.current.count += found.entries.length;
+      setRows([...rows, ...found.entries]);
+      setNext(found.next);
+    } catch (error) {
+      setProblem(/** @type {Error} */ (error).message);
+    }
   };
   return html`<div><div class="pagehead" key="head"><h1>Jobs</h1>
       <label class="check">Loop <select value=${loop} onChange=${(/** @type {any} */ e) => setLoop(e.target.value)}><option value="">all</option>${[...(loops.value?.keys() ?? [])].sort().map((tag) => html`<option key=${tag} value=${tag}>${tag}</option>`)}</select></label>

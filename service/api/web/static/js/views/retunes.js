@@ -1,6 +1,6 @@
 // @ts-check
 /** Retunes of many loops: the list, one retune with its loops, the form. */
-import { useEffect, useState } from "../../vendor/hooks.js";
+import { useEffect, useRef, useState } from "../../vendor/hooks.js";
 import { notAborted, sendAbort } from "../aborting.js";
 import { ask, askPage, askWith, command } from "../api.js";
 import { html } from "../html.js";
@@ -8,6 +8,12 @@ import { entered, ms, when } from "../numbers.js";
 import { go, jobPath, loopPath } from "../router.js";
 import { isSilent, jobs, may, sign, signature } from "../state.js";
 import { reasonWords, stageName } from "../words.js";
+
+const AGAIN_MS = 5000;
+const [PAGE, MOST] = [50, 1000];
+
+/** Whether loops of a retune are still to come, or under test. @param {{state: string}} retune */
+const isGoing = ({ state }) => state === "running" || state === "stopping";
 
 /** @param {{id: string}} props */
 export function RetunesView({ id }) {
@@ -21,20 +27,44 @@ function All() {
   const [rows, setRows] = useState(/** @type {any[] | null} */ (null));
   const [next, setNext] = useState(/** @type {string | null} */ (null));
   const [problem, setProblem] = useState("");
+  const shown = useRef(PAGE); // those that were asked for with More stay
+  const mark = jobs.value.map((each) => `${each.id}${each.state}`).join();
+  const going = !rows || rows.some(isGoing);
   useEffect(() => {
     document.title = "Retunes · Loopwright";
-    askPage("/retunes?limit=50").then((found) => {
+    const stop = new AbortController();
+    const look = () => askPage(`/retunes?limit=${shown.current}`, stop.signal).then((found) => {
       setRows(found.entries);
       setNext(found.next);
-    }, (error) => setProblem(error.message));
-  }, []);
+      setProblem("");
+    }, (error) => { if (!stop.signal.aborted) setProblem(error.message); });
+    void look();
+    const timer = going ? setInterval(() => { if (!document.hidden && !isSilent.peek()) void look(); }, AGAIN_MS) : undefined;
+    return () => {
+      stop.abort();
+      clearInterval(timer);
+    };
+  }, [mark, going]);
+  const more = async () => {
+    try {
+      const found = await askPage(String(next));
+      shown.current = Math.min(MOST, (rows ?? []).length + found.entries.length);
+      setRows([...(rows ?? []), ...found.entries]);
+      setNext(found.next);
+    } catch (error) {
+      setProblem(/** @type {Error} */ (error).message);
+    }
+  };
   return html`<div><div class="pagehead" key="head"><h1>Retunes of many loops</h1></div>
     ${may.operate.value && html`<${Form} key="form" />`}
     ${problem && html`<p class="refusal" role="alert" key="problem">${problem}</p>`}
     ${rows && (rows.length ? html`<div class="table" key="table" style=${{ marginTop: "16px" }}><table><thead><tr><th>Date</th><th>Asked by</th><th>State</th><th>Loops</th></tr></thead><tbody>
       ${rows.map((each) => html`<tr class="row" key=${each.id} onClick=${() => go(`/ui${each.url}`)}><td><a href=${`/ui${each.url}`}>${when(each.created_at)}</a></td><td>${each.requested_by}</td><td>${each.state}</td><td>${countWords(each.counts)}</td></tr>`)}</tbody></table></div>` : html`<p class="calm" key="none">No retune of many loops was asked for yet.</p>`)}
-    ${next && html`<p class="foot" key="more"><button onClick=${async () => { const found = await askPage(next); setRows([...(rows ?? []), ...found.entries]); setNext(found.next); }}>More</button></p>`}</div>`;
+    ${next && html`<p class="foot" key="more"><button onClick=${more}>More</button></p>`}</div>`;
 }
+
+/** Whether a field holds something else than a whole number. @param {string} text */
+const wrong = (text) => (Number.isInteger(entered(text) ?? 0) ? undefined : "true");
 
 function Form() {
   const [pattern, setPattern] = useState("");
@@ -47,23 +77,27 @@ function Form() {
   const [sending, setSending] = useState(false);
   /** @type {Record<string, any>} */
   const body = { method: "fast", ms: Number(asked), pattern: pattern.trim() || null };
+  let bad = "";
   for (const [name, text] of [["at_once_per_bus", perBus], ["at_once_per_area", perArea], ["stop_after_failures", failures]]) {
     const value = entered(text);
-    if (value !== null && Number.isInteger(value)) body[name] = value;
+    if (value === null) continue;
+    if (Number.isInteger(value)) body[name] = value;
+    else bad = "A field is not a whole number.";
   }
   const text = JSON.stringify(body);
+  const isOfThis = !!preview && preview.of === text; // what is begun is what was said, and not what has been typed since
   useEffect(() => {
-    if (!pattern.trim()) {
+    if (!pattern.trim() || bad) {
       setPreview(null);
       return;
     }
     const stop = new AbortController();
-    const timer = setTimeout(() => askWith("/retunes/preview", JSON.parse(text), stop.signal).then((found) => { setPreview(found); setProblem(null); }, (error) => { if (!stop.signal.aborted) { setPreview(null); setProblem(error); } }), 300);
+    const timer = setTimeout(() => askWith("/retunes/preview", JSON.parse(text), stop.signal).then((found) => { setPreview({ ...found, of: text }); setProblem(null); }, (error) => { if (!stop.signal.aborted) { setPreview(null); setProblem(error); } }), 300);
     return () => {
       clearTimeout(timer);
       stop.abort();
     };
-  }, [text]);
+  }, [text, bad]);
   const start = async () => {
     setSending(true);
     try {
@@ -79,14 +113,15 @@ function Form() {
     <div class="options" key="fields" style=${{ borderTop: 0, marginTop: 0 }}>
       <label class="field"><span>Loops</span><input type="text" class="wide" placeholder="TIC-* or *" value=${pattern} onInput=${on(setPattern)} /></label>
       <label class="field"><span>Robustness asked for <b>Ms ${ms(Number(asked))}</b></span><input type="range" min="1.2" max="2" step="0.05" value=${asked} onInput=${on(setAsked)} /></label>
-      <label class="field"><span>At once per bus</span><input type="text" inputmode="numeric" value=${perBus} onInput=${on(setPerBus)} /></label>
-      <label class="field"><span>At once per area</span><input type="text" inputmode="numeric" value=${perArea} onInput=${on(setPerArea)} /></label>
-      <label class="field"><span>Stop after failures</span><input type="text" inputmode="numeric" value=${failures} onInput=${on(setFailures)} /></label></div>
+      <label class="field"><span>At once per bus</span><input type="text" inputmode="numeric" value=${perBus} aria-invalid=${wrong(perBus)} onInput=${on(setPerBus)} /></label>
+      <label class="field"><span>At once per area</span><input type="text" inputmode="numeric" value=${perArea} aria-invalid=${wrong(perArea)} onInput=${on(setPerArea)} /></label>
+      <label class="field"><span>Stop after failures</span><input type="text" inputmode="numeric" value=${failures} aria-invalid=${wrong(failures)} onInput=${on(setFailures)} /></label></div>
     ${preview && html`<div key="what" class="explain">${preview.summary.map((/** @type {string} */ line) => html`<p key=${line}>${line}</p>`)}</div>`}
     ${preview?.loops.filter((/** @type {any} */ each) => !each.would_start).map((/** @type {any} */ each) => html`<p class="note" key=${each.loop}><b>${each.loop}</b> ${each.obstacles[0]?.detail}. ${each.obstacles[0]?.advice}</p>`)}
     ${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice}</span></p>`}
     <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} /></label>
-      <button class="main" disabled=${sending || isSilent.value || !preview?.would_start || !signature.value.trim()} onClick=${start}>${preview ? `Retune ${preview.would_start} ${preview.would_start === 1 ? "loop" : "loops"}` : "Retune"}</button></div></section>`;
+      <span class="quiet" role="status">${bad}</span>
+      <button class="main" disabled=${sending || isSilent.value || !!bad || !isOfThis || !preview?.would_start || !signature.value.trim()} onClick=${start}>${preview ? `Retune ${preview.would_start} ${preview.would_start === 1 ? "loop" : "loops"}` : "Retune"}</button></div></section>`;
 }
 
 /** @param {{id: string}} props */
@@ -99,16 +134,16 @@ function One({ id }) {
   useEffect(() => {
     document.title = `Retune ${id} · Loopwright`;
     const stop = new AbortController();
-    const look = () => ask(`/retunes/${encodeURIComponent(id)}`, stop.signal).then(setFound, (error) => { if (!stop.signal.aborted) setProblem(error.message); });
+    const look = () => ask(`/retunes/${encodeURIComponent(id)}`, stop.signal).then((now) => { setFound(now); setProblem(""); }, (error) => { if (!stop.signal.aborted) setProblem(error.message); });
     void look();
-    const timer = setInterval(look, 5000);
+    const timer = setInterval(look, AGAIN_MS);
     return () => {
       stop.abort();
       clearInterval(timer);
     };
   }, [id, mark]);
   if (!found) return html`<p class="calm" role="status">${problem || "Asking for the retune…"}</p>`;
-  const going = found.state === "running" || found.state === "stopping";
+  const going = isGoing(found);
   const abort = async () => {
     setAsking(false);
     setAborting("Abort sent, no answer yet.");
