@@ -13,11 +13,13 @@ from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, Page, Route, expect
+from sqlalchemy import delete
 
 from loopwright.service.api.app import create_app
 from loopwright.service.inputs.config import parse_site
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.live.messages import RETRY_MS
+from loopwright.service.store.tables import LoopRow
 from loopwright.tuning.reasons import Failed, Reason
 from tests.browser import person
 from tests.browser.pages import Pages
@@ -260,6 +262,24 @@ class TestStream:
         service.wait(service.jobs.start(TAG, FastRetune()).id)
         expect(page.get_by_role("main")).to_contain_text("Not confirmed that the loop is as before the test")
         expect(page).to_have_title("(1) Loopwright")
+
+
+def test_a_job_whose_loop_is_not_configured_any_more(site: SimulatedSite, pages: Pages) -> None:
+    job_id = proposal(site.service, OTHER)
+    del site.service.loops[OTHER]
+    with site.service.store.writing() as session:
+        session.execute(delete(LoopRow).where(LoopRow.tag == OTHER))
+    page = pages.open(f"/ui/jobs/{job_id}")
+    expect(page.get_by_role("main")).to_contain_text(f"The loop {OTHER} is not configured any more")
+    expect(person.headline(page)).to_have_text("New gains are proposed")
+    expect(page.get_by_role("link", name="Report")).to_be_visible()
+
+
+def test_an_address_that_was_typed_in_wrongly(site: SimulatedSite, pages: Pages) -> None:
+    page = pages.open("/ui/")
+    with pages.expecting("status of 404"):
+        page.goto("/ui/loops/100%")
+        expect(page.get_by_role("main")).to_contain_text("There is no loop 100% here.")
 
 
 def test_a_trend_goes_on_when_the_clock_of_the_service_is_put_back(site: SimulatedSite, page: Page) -> None:

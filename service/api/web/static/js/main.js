@@ -7,7 +7,7 @@ import { abortJob } from "./aborting.js";
 import { forbidden, signedOut } from "./api.js";
 import { html } from "./html.js";
 import { beginPalette } from "./palette.js";
-import { beginRouting, go, path } from "./router.js";
+import { beginRouting, decoded, go, path } from "./router.js";
 import { jobs, may, refreshLoops, refreshSession } from "./state.js";
 import { stream } from "./stream.js";
 import { AbnormalView } from "./views/abnormal.js";
@@ -23,7 +23,7 @@ import { SignIn } from "./views/signin.js";
 
 function View() {
   const at = path.value;
-  const part = at.split("/").map(decodeURIComponent);
+  const part = at.split("/").map(decoded);
   if (part[2] === "loops" && part[3]) return html`<${LoopView} key=${`loop ${part[3]}`} tag=${part[3]} />`;
   if (part[2] === "jobs" && part[3]) return html`<${JobView} key=${`job ${part[3]}`} id=${part[3]} />`;
   if (part[2] === "jobs") return html`<${JobsView} key="jobs" />`;

@@ -24,6 +24,15 @@ export function beginRouting() {
   });
 }
 
+/** A part of a path as it was meant; one that was typed in and is no such text stays as it is. @param {string} part */
+export function decoded(part) {
+  try {
+    return decodeURIComponent(part);
+  } catch {
+    return part;
+  }
+}
+
 /** @param {string} tag */
 export const loopPath = (tag) => `/ui/loops/${encodeURIComponent(tag)}`;
 /** The page's path of a job. @param {string} url of the API */
