@@ -212,6 +212,22 @@ class TestStream:
         jobs.stop()
         service.store.close()
 
+    def test_a_service_that_comes_back_without_the_loop(self, tmp_path: Path, browser: Browser) -> None:
+        service = Service(tmp_path)
+        with served(create_app(service.jobs)) as server:
+            pages = Pages(browser, f"http://127.0.0.1:{server.port}")
+            page = pages.open(f"/ui/loops/{OTHER}")
+            expect(page.get_by_role("heading", name=OTHER)).to_be_visible()
+        service.jobs.stop()
+        service.loops = parse_site({"loops": [loop_entry()]}, "test").loops
+        jobs = service.more_jobs(lambda config: FakeLoop(service.controller))
+        with served(create_app(jobs), port=server.port):
+            expect(page.get_by_role("main")).to_contain_text(f"There is no loop {OTHER} here.")
+            expect(page.locator(".banner[role=alert]")).not_to_be_attached()
+            pages.close()
+        jobs.stop()
+        service.store.close()
+
     def test_a_connection_that_is_dead_is_made_anew(self, site: SimulatedSite, pages: Pages) -> None:
         """A stream that never says anything again, and never ends, as of a gateway that has lost its power."""
         page = pages.open("/ui/")

@@ -133,6 +133,7 @@ class Stream {
     this.retry = setTimeout(async () => {
       try {
         await ask("/session"); // says 401 where the session is over or the key was revoked
+        if (this.tag && !signedOut.value) await refreshLoops(); // there is no stream of a loop that is not configured any more
       } catch {
         // The stream says more.
       }
