@@ -311,3 +311,27 @@ def test_a_trend_goes_on_when_the_clock_of_the_service_is_put_back(site: Simulat
         }"""
     )
     assert found == [1, 1, 1, 1, None, 2, 2, 2, 2]
+
+
+def test_no_line_is_drawn_across_missing_samples_of_a_record(site: SimulatedSite, page: Page) -> None:
+    record = {
+        "at_s": [0.0, 1.0, 9.0], "until_s": [0.0, 1.0, 9.0], "pv_min": [1.0, 2.0, 3.0], "pv_max": [1.0, 2.0, 3.0],
+        "mv_min": [4.0, 5.0, 6.0], "mv_max": [4.0, 5.0, 6.0], "sp": [1.0, 1.0, 1.0], "gap_before": [False, False, True],
+        "marks": [], "noise": None,
+        "explained": {"model": [1.0, 2.0, 3.0], "residual_min": [0.0] * 3, "residual_max": [0.0] * 3},
+    }  # fmt: skip
+    found = page.evaluate(
+        """async (record) => {
+          const { columns } = await import("/ui/js/views/record.js");
+          const found = columns(record);
+          const shown = (values) => values.map((each) => (Number.isNaN(each) ? null : each));
+          return [found.t, ...["pv", "mv", "model"].map((name) => shown(found[name]))];
+        }""",
+        record,
+    )
+    assert found == [
+        [0, 1, 5, 9],
+        [1, 2, None, 3],
+        [4, 5, None, 6],
+        [1, 2, None, 3],
+    ]

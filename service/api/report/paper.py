@@ -96,7 +96,7 @@ def paper(source: ReportSource) -> str:
         head=_head(source),
         trust=" ".join(trust(job)),
         verdict=sentence(None if job.comparison is None else job.comparison.verdict),
-        decided=f"{_decided(job)} {_afterwards(job, decimals, pv_unit)}".strip(),
+        decided=f"{_decided(job, source.events)} {_afterwards(job, decimals, pv_unit)}".strip(),
         table=_table(old, new, before, after, job, pv_unit),
         has_before=old is not None,
         has_after=new is not None,
@@ -196,9 +196,14 @@ def _head(source: ReportSource) -> list[Row]:
     return rows
 
 
-def _decided(job: JobView) -> str:
+def _decided(job: JobView, events: Sequence[JobEvent]) -> str:
     if job.decided is not None:
-        what = "The new gains were accepted" if job.decided.what == "accept" else "The old gains were kept"
+        if job.decided.what == "accept":
+            what = "The new gains were accepted"
+        elif any(event.kind == "state" and event.data.get("state") == JobState.ACCEPTED for event in events):
+            what = "The new gains were accepted first, and the old ones put back"
+        else:
+            what = "The old gains were kept"
         return f"{what} by {job.decided.by}, {n.date(job.decided.at)} UTC."
     if job.superseded_by is not None:
         return f"Nothing was decided before the later test, {job.superseded_by}."

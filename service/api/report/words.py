@@ -42,7 +42,7 @@ _ENDS = {
     JobState.RUNNING: "Under test",
     JobState.PROPOSED: "New gains are proposed",
     JobState.ACCEPTED: "The new gains were accepted",
-    JobState.ROLLED_BACK: "The old gains were kept",
+    JobState.ROLLED_BACK: "Rolled back to the old gains",
     JobState.NO_GAIN: "The loop is tuned as well as asked already",
     JobState.REHEARSED: "Rehearsed: gains were found without a test of the loop",
     JobState.REFUSED: "No result to trust",

@@ -129,6 +129,10 @@ def test_the_hash_is_recomputed_and_outlives_the_decision(service: Service, clie
     _, document = report(client, job)
     assert expected == recomputed(client, job) and expected in document.text
     assert "The new gains were accepted by C. Berg" in document.text
+    client.post(f"/jobs/{job}/rollback", json={"by": "D. Roth"})
+    text = report(client, job)[1].text
+    assert "The new gains were accepted first, and the old ones put back by D. Roth" in text
+    assert "The old gains were kept" not in text
     fakes.add_samples(service.store, job, "relay", service.store.samples(job)[0][1][:1])
     assert recomputed(client, job) != expected and recomputed(client, job) in report(client, job)[1].text
 

@@ -95,7 +95,12 @@ export function columns(found) {
     it.model?.push(found.explained.model[n] ?? NaN);
     it.left.push(found.explained?.[`residual_${which}`][n] ?? NaN);
   };
+  const gap = (/** @type {number} */ t) => {
+    it.t.push(t);
+    for (const column of [it.pv, it.mv, it.sp, it.left, ...(it.model ? [it.model] : [])]) column.push(NaN);
+  };
   for (let n = 0; n < found.at_s.length; n++) {
+    if (found.gap_before[n] && n) gap((found.until_s[n - 1] + found.at_s[n]) / 2); // no line across samples that are missing
     put(n, found.at_s[n], "min");
     if (found.until_s[n] > found.at_s[n]) put(n, found.until_s[n], "max");
   }

@@ -19,7 +19,7 @@ export function Result({ loop, detail, job, quiet = false, own = false, onChange
   return html`<section aria-label="Result">
     <div class="headline" key="head"><div><h2>${headline(job)}</h2>${trust && html`<p>${trust}</p>`}</div>
       <p class="facts">${when(job.ended_at ?? job.created_at)} · ${job.requested_by} · ${methodName(job.method)} · ${duration(job.plant_time_s)} of plant time<br />
-        ${job.decided && html`${job.decided.what === "accept" ? "accepted" : "old gains kept"} by ${job.decided.by}, ${when(job.decided.at)} · `}
+        ${job.decided && html`${job.decided.what === "accept" ? "accepted" : job.watch ? "old gains put back" : "old gains kept"} by ${job.decided.by}, ${when(job.decided.at)} · `}
         <a href=${`${job.url}/report`} target="_blank">Report</a><a href=${`${job.url}/samples?format=csv`} target="_blank">Samples</a>${!own && html`<a href=${jobPath(job.url)}>job ${job.id}</a>`}</p></div>
     ${job.reason && html`<div class="card" key="why"><p>${sentence(job.detail)}</p><p class="advice">${job.advice}</p>${After(loop, job)}</div>`}
     ${job.superseded_by && html`<p class="refusal" key="later">A later test came: <a href=${jobPath(job.superseded_by)}>its result</a>.</p>`}
