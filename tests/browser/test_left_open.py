@@ -335,3 +335,26 @@ def test_no_line_is_drawn_across_missing_samples_of_a_record(site: SimulatedSite
         [4, 5, None, 6],
         [1, 2, None, 3],
     ]
+
+
+def test_the_longest_window_of_a_fast_loop_has_its_beginning(site: SimulatedSite, page: Page) -> None:
+    """Half an hour and more at 100 samples a second: thinned, with its peaks and with its gap."""
+    found = page.evaluate(
+        """async () => {
+          const { Ring } = await import("/ui/js/ring.js");
+          const ring = new Ring();
+          const peak = 20 * 6000; // 20 min after the beginning
+          for (let n = 0; n < 200_000; n++) {
+            if (n === 150_000) ring.gap();
+            ring.push(1e9 + n / 100, n === peak ? 9 : Math.sin(n / 500), 0, 40);
+          }
+          const { at, pv } = ring.since(ring.last - 1800);
+          let longest = 0;
+          for (let n = 1; n < at.length; n++) longest = Math.max(longest, at[n] - at[n - 1]);
+          return [ring.last - at[0], at.length <= ring.room, Math.max(...pv.filter((each) => each === each)), longest,
+                  pv.filter((each) => each !== each).length, at.every((each, n) => !n || each > at[n - 1])];
+        }"""
+    )
+    back_s, fits, largest, longest_s, gaps, in_order = found
+    assert back_s >= 1800.0 and fits and largest == 9.0 and gaps == 1 and in_order
+    assert longest_s < 5.0, "less than three pixels of the window"

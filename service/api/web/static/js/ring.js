@@ -1,7 +1,12 @@
 // @ts-check
-/** The latest samples of one loop, in typed arrays which a plot takes as they are. A gap is a sample of NaN. */
+/**
+ * The latest samples of one loop, in typed arrays which a plot takes as they are. A gap is a sample of NaN. Of a fast loop the
+ * older ones are thinned, again and again, so that the longest window has its beginning.
+ */
 
 const ROOM = 40_000;
+/** Four samples over so long are thinned no more: a pixel of the longest window is two seconds. */
+const COARSE_S = 3;
 /** Samples come in order: one that is earlier than the latest by more than this says that the service's clock was put back. */
 export const SET_BACK_S = 2;
 
@@ -35,9 +40,10 @@ export class Ring {
   /** @param {number} at @param {number | null} pv @param {number | null} sp @param {number | null} mv */
   push(at, pv, sp, mv) {
     if (!(at > this.last) && this.length) return; // had already
+    if (this.length >= this.room) this.thin();
     if (this.end === 2 * this.room) {
-      for (const column of [this.at, this.pv, this.sp, this.mv]) column.copyWithin(0, this.end - this.room + 1, this.end);
-      this.end = this.room - 1;
+      for (const column of this.columns) column.copyWithin(0, this.begin, this.end);
+      this.end -= this.begin;
       this.begin = 0;
     }
     const n = this.end++;
@@ -45,7 +51,33 @@ export class Ring {
     this.pv[n] = pv ?? NaN;
     this.sp[n] = sp ?? NaN;
     this.mv[n] = mv ?? NaN;
-    if (this.length > this.room) this.begin = this.end - this.room;
+  }
+
+  get columns() {
+    return [this.at, this.pv, this.sp, this.mv];
+  }
+
+  /** Thins the older half: of each four samples those of the least and of the largest PV stay, and a gap with its neighbours. */
+  thin() {
+    const half = this.begin + (this.length >> 1);
+    let to = half; // from the newer end on, so that none is written over that is still to be looked at
+    for (let last = half; last > this.begin; last -= 4) {
+      const first = Math.max(this.begin, last - 4);
+      let [low, high] = [first, first];
+      let stays = this.at[last - 1] - this.at[first] >= COARSE_S; // as thin as it may be
+      for (let n = first; n < last; n++) {
+        stays ||= Number.isNaN(this.pv[n]);
+        if (this.pv[n] < this.pv[low]) low = n;
+        if (this.pv[n] >= this.pv[high]) high = n;
+      }
+      for (let n = last - 1; n >= first; n--) {
+        if (!stays && n !== low && n !== high) continue;
+        to--;
+        for (const column of this.columns) column[to] = column[n];
+      }
+    }
+    const least = this.room >> 3; // where no more is thinned the oldest go
+    this.begin = Math.max(to, this.begin + least);
   }
 
   /** A gap after the latest sample: no line is drawn across. */
