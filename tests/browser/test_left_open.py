@@ -30,6 +30,12 @@ from tests.unit.service.served import served
 
 LOOP = f"/ui/loops/{TAG}"
 OTHER = "FIC-2"
+LIVE_JOB: dict[str, Any] = {
+    "id": "4f0c2a9be113", "url": "/jobs/4f0c2a9be113", "loop": TAG, "host": "gw-2", "state": "running",
+    "dry_run": False, "requested_by": "A. Lind", "stage": "relay", "progress": None, "remaining_plant_time_s": None,
+    "plant_time_s": 0.0, "stopping": True,
+}  # fmt: skip
+"""Of a gateway that says nothing."""
 
 
 @dataclass
@@ -135,19 +141,33 @@ class TestAbort:
     def test_that_it_is_stored_is_not_said_to_be_heard_by_a_gateway_that_is_silent(
         self, site: SimulatedSite, pages: Pages
     ) -> None:
-        job = {
-            "id": "4f0c2a9be113", "url": "/jobs/4f0c2a9be113", "loop": TAG, "host": "gw-2", "state": "running",
-            "dry_run": False, "requested_by": "A. Lind", "stage": "relay", "progress": None,
-            "remaining_plant_time_s": None, "plant_time_s": 0.0, "stopping": True,
-        }  # fmt: skip
         hello = {"host": "local", "version": "0.1.0", "now_s": 1769860830.5, "loops": [], "back_s": 10.0}
-        text = stream(hello=hello, jobs={"jobs": [job]})
+        text = stream(hello=hello, jobs={"jobs": [LIVE_JOB]})
         page = pages.open("/ui/jobs")
         page.route("**/live*", lambda route: route.fulfill(body=text, content_type="text/event-stream"))
         page.reload()
         dock = person.dock(page)
         expect(dock).to_contain_text("asked to stop, gateway gw-2 has not said that it has heard")
         expect(dock).not_to_contain_text("restored")
+
+    def test_one_whose_answer_was_lost_is_confirmed_by_the_stream(self, site: SimulatedSite, pages: Pages) -> None:
+        page = pages.open("/ui/jobs")
+        job = LIVE_JOB | {"host": "local", "progress": 0.4}
+        hello = {"host": "local", "version": "0.1.0", "now_s": time.time(), "loops": [], "back_s": 10.0}
+        text = stream(hello=hello, jobs={"jobs": [job | {"stopping": False}]})
+        page.route("**/live*", lambda route: route.fulfill(body=text, content_type="text/event-stream"))
+        page.reload()
+        page.evaluate(
+            """(id) => import("/ui/js/aborting.js").then(({ abortError }) => {
+              abortError.value = new Map([[id, "Abort not confirmed: The service has not answered within 10 s."]]);
+            })""",
+            job["id"],
+        )
+        dock = person.dock(page)
+        expect(dock.get_by_role("alert")).to_be_visible()
+        text = stream(hello=hello, jobs={"jobs": [job]})
+        expect(dock).to_contain_text("stopping, the loop is being restored")
+        expect(dock.get_by_role("alert")).not_to_be_attached()
 
     def test_it_is_not_refused_for_the_session_of_another_window(self, site: SimulatedSite, pages: Pages) -> None:
         """Somebody has signed in anew in another window: the cookie is another one, and what is shown beside it too."""

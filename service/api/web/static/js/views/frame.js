@@ -85,7 +85,7 @@ export function Dock() {
 function Cell({ job, more }) {
   const stop = stopWords(job);
   const stopping = stop !== "";
-  const error = abortError.value.get(job.id);
+  const error = stopping ? undefined : abortError.value.get(job.id); // an answer that was late or lost: the stream says it
   const left = isSilent.value ? "" : stopping ? "" : job.remaining_plant_time_s === null ? "" : `${duration(job.remaining_plant_time_s)} left`;
   const stage = stopping ? stop : job.state === "queued" ? "waits for its turn" : stageName(job.stage) || "begins";
   return html`<div class="cell">
