@@ -64,7 +64,7 @@ def test_a_second_path_is_found_in_operation_and_rolled_back(site: SimulatedSite
     page.get_by_role("button", name="Roll back to the old gains").click()
     person.sign(page)
     page.get_by_role("button", name=f"Roll {TAG} back").click()
-    expect(person.headline(page)).to_have_text("The old gains are in effect")
+    expect(person.headline(page)).to_have_text("Rolled back to the old gains")
     expect(page.get_by_role("region", name="Result").first).to_contain_text(f"old gains put back by {NAME}")
     assert loop.service.controller.state.gains == OLD
 

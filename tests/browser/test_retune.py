@@ -69,7 +69,7 @@ def test_retuned_compared_accepted_and_rolled_back(site: Site, page: Page) -> No
     page.get_by_role("button", name="Roll back to the old gains").click()
     expect(person.decision(page)).to_contain_text("Write the old gains, Kp 80.00 %/°C, Ti 1.200 s, back")
     page.get_by_role("button", name=f"Roll {TAG} back").click()
-    expect(person.headline(page)).to_have_text("The old gains are in effect")
+    expect(person.headline(page)).to_have_text("Rolled back to the old gains")
     assert site.is_home() and site.job(job["url"])["state"] == "rolled_back"
 
 

@@ -106,7 +106,7 @@ def test_what_one_accepts_the_other_sees(site: Site, pages: Pages, page: Page) -
     other.get_by_role("button", name="Roll back to the old gains…").click()
     person.sign(other, OTHER)
     other.get_by_role("button", name=f"Roll {TAG} back").click()
-    expect(person.headline(page)).to_have_text("The old gains are in effect")
+    expect(person.headline(page)).to_have_text("Rolled back to the old gains")
     assert site.is_home()
 
 

@@ -99,7 +99,7 @@ export function headline(job) {
     case "running": return job.stopping ? "Stopping, the loop is being restored" : "Under test";
     case "proposed": return job.superseded_by ? "Proposed, not decided, a later test came" : "New gains are proposed";
     case "accepted": return "Accepted";
-    case "rolled_back": return "The old gains are in effect";
+    case "rolled_back": return "Rolled back to the old gains";
     case "no_gain": return "The loop is tuned as well as asked already";
     case "rehearsed": return "Rehearsed: gains found without a test of the loop";
     case "refused": return `No result to trust: ${why}`;
@@ -114,7 +114,7 @@ export function headline(job) {
 export function stateWords(job) {
   switch (job.state) {
     case "proposed": return job.superseded_by ? "not decided, a later test came" : "decision waits";
-    case "rolled_back": return "old gains in effect";
+    case "rolled_back": return "rolled back";
     case "no_gain": return "tuned already";
     case "refused": return `refused: ${reasonWords(job.reason)}`;
     case "aborted": return `stopped: ${reasonWords(job.reason)}`;
