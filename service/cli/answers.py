@@ -5,7 +5,6 @@ from __future__ import annotations
 from pydantic import BaseModel, JsonValue
 
 from loopwright.service.api.job_views import LockView
-from loopwright.service.cli.client import parsed
 from loopwright.service.states.job_state import JobState
 
 
@@ -38,18 +37,13 @@ class StateEvent(BaseModel):
 
 
 ShownEvent = ProgressEvent | StageDoneEvent | NoteEvent | StateEvent
-_EVENTS: dict[str, type[ShownEvent]] = {
+SHOWN_EVENTS: dict[str, type[ShownEvent]] = {
     "progress": ProgressEvent,
     "stage_done": StageDoneEvent,
     "note": NoteEvent,
     "state": StateEvent,
 }
-
-
-def job_event(kind: str, data: object) -> ShownEvent | None:
-    """Returns an event of GET /jobs/{id}/events; None for a kind that the commands do not show."""
-    model = _EVENTS.get(kind)
-    return None if model is None else parsed(model, data)
+"""The events of GET /jobs/{id}/events that the commands show, by kind."""
 
 
 class JobAnswer(BaseModel):

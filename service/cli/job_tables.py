@@ -12,7 +12,7 @@ from loopwright.service.api.job_views import JobView, LockView, LoopDetail
 from loopwright.service.api.report.words import stage_found, stage_name
 from loopwright.service.api.watch_views import WatchView
 from loopwright.service.cli import terminal
-from loopwright.service.cli.answers import NoteEvent, ProgressEvent, StageDoneEvent, StateEvent, job_event
+from loopwright.service.cli.answers import SHOWN_EVENTS, NoteEvent, ProgressEvent, StageDoneEvent, StateEvent
 from loopwright.service.cli.client import Client, parsed
 from loopwright.service.cli.result_table import ShownResult, result_table
 from loopwright.service.cli.terminal import cell, figure
@@ -35,7 +35,8 @@ def follow(client: Client, job_url: str, to: Console | None = None) -> JobView:
     with Progress(*columns, console=to or terminal.progress_console) as bars:
         task = bars.add_task("queued", total=1.0, left="")
         for kind, data in client.events(job_url):
-            match job_event(kind, data):
+            form = SHOWN_EVENTS.get(kind)
+            match None if form is None else parsed(form, data):
                 case ProgressEvent(stage=stage, progress=progress, remaining_plant_time_s=left):
                     text = "" if left is None else f"about {left:.0f} s of plant time left"
                     bars.update(task, completed=progress, description=stage or "", left=text)
