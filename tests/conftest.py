@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from functools import cache
 from types import ModuleType
 from typing import Any
@@ -16,6 +17,7 @@ from hypothesis import settings
 
 from loopwright.service.cli.demo import vcan_usable
 from tests.browser import CHROMIUM
+from tests.migrated_once import migrated_once
 
 settings.register_profile("untimed", settings.default, deadline=None)  # a busy machine makes any test slow
 settings.load_profile("untimed")
@@ -133,3 +135,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     for title, counts in config.stash[_COUNTS].items():
         told = ", ".join(f"{count} {kind}" for kind, count in counts.items())
         terminalreporter.write_line(f"{title}: {told}")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def tables_made_once() -> Iterator[None]:
+    with migrated_once():
+        yield
