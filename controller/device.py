@@ -15,7 +15,7 @@ from typing import Any, Protocol
 from loopwright.controller.channel import Channel, Home, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.controller.session import Session
-from loopwright.protocol.bus import Bus
+from loopwright.protocol.bus import Bus, BusError
 from loopwright.protocol.device_runtime import Runtime
 from loopwright.protocol.object_dictionary import Dictionary, Writer
 from loopwright.protocol.objects import Device, Value
@@ -277,27 +277,35 @@ class ControllerDevice:
         channel = session.channel
         status = channel.mode, channel.on_trial, channel.setpoint, session.is_open, session.cause
         if status != self.told[at]:
-            self.told[at] = status
             self._send(self._status_ids[at], STATUS_FRAME.pack(*status))
+            self.told[at] = status  # last: what the bus has not taken is told again
 
     def _on_tick(self, now: float) -> None:
         if self.runtime.state is not NmtState.OPERATIONAL:
             return
-        silent = []
-        for at, session in enumerate(self.sessions):
-            was_open = session.number
-            session.tick(now)
-            if was_open and not session.number:
-                self._say_end(at)
-            self._send_unasked(at)
-            self._report_if_new(at)
-            if session.silent:
-                silent.append(at + 1)
+        failed: BusError | None = None
+        for at in range(len(self.sessions)):
+            try:
+                self._tick_channel(at, now)
+            except BusError as error:  # the time of the other channels goes on
+                failed = error
+        self._write_soon()
+        if failed is not None:
+            raise failed
+        silent = [at for at, session in enumerate(self.sessions, start=1) if session.silent]
         if silent:
             self.runtime.raise_error(Emcy.NO_PV, bytes(silent[:1]))
         else:
             self.runtime.clear_error(Emcy.NO_PV)
-        self._write_soon()
+
+    def _tick_channel(self, at: int, now: float) -> None:
+        session = self.sessions[at]
+        was_open = session.number
+        session.tick(now)
+        if was_open and not session.number:
+            self._say_end(at)
+        self._send_unasked(at)
+        self._report_if_new(at)
 
     # Sessions
 
