@@ -6,12 +6,12 @@ own). `controller.session` decides who may command what, and when a test ends.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from loopwright.controller.pid import Parameters, Pid
 from loopwright.controller.relay import Relay, RelaySettings
 from loopwright.protocol.profile import Mode, RelayState
+from loopwright.protocol.real32 import fits
 
 __all__ = ["Channel", "Home", "Mode", "Parameters", "RelaySettings", "RelayState", "Settings"]
 
@@ -265,5 +265,5 @@ class Channel:
 
 
 def _finite(*values: float) -> None:
-    if not all(math.isfinite(value) for value in values):
-        raise ValueError("values must be finite")
+    if not all(fits(value) for value in values):
+        raise ValueError("values must be finite, and within the range of a REAL32")

@@ -13,6 +13,8 @@ from __future__ import annotations
 import math
 from dataclasses import astuple, dataclass
 
+from loopwright.protocol.real32 import fits
+
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
@@ -32,8 +34,8 @@ class Parameters:
     c: float = 0.0
 
     def __post_init__(self) -> None:
-        if not all(math.isfinite(value) for value in astuple(self)):
-            raise ValueError("controller parameters must be finite")
+        if not all(fits(value) for value in astuple(self)):
+            raise ValueError("controller parameters must be finite, and within the range of a REAL32")
         if self.Kp <= 0:
             raise ValueError("Kp must be positive: the direction is set by the controller's action")
         if min(self.Ti, self.Td, self.Tf) < 0:

@@ -28,6 +28,7 @@ from loopwright.protocol.profile import (
     OnMissingAnswer,
     channel_ids,
 )
+from loopwright.protocol.real32 import nearest
 from loopwright.protocol.sdo import SdoAbort
 
 _MAX_CATCH_UP = 5
@@ -133,7 +134,7 @@ class PlantDevice:
         values = [plant.step(mv) for plant, mv in zip(self.plants, self.mv, strict=True)]
         self._send(SYNC_ID, SYNC_FRAME.pack(self._sync_counter))
         for can_id, pv in zip(self._pv_ids, values, strict=True):
-            self._send(can_id, PV_FRAME.pack(pv, number))
+            self._send(can_id, _pv_frame(pv, number))
 
     def _on_mv(self, at: int, data: bytes) -> None:
         mv, number = MV_FRAME.unpack(data)
@@ -267,3 +268,11 @@ class PlantDevice:
 
     def _write_mv(self, sub: int, value: Value) -> None:
         self.mv[sub - 1] = float(value)
+
+
+def _pv_frame(pv: float, number: int) -> bytes:
+    """Returns the frame of a PV; beyond the range of a REAL32, as of a plant that runs away, it is infinite."""
+    try:
+        return PV_FRAME.pack(pv, number)
+    except OverflowError:
+        return PV_FRAME.pack(nearest(pv), number)

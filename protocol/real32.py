@@ -22,6 +22,11 @@ def nearest(value: float) -> float:
     return c_float(value).value
 
 
+def fits(value: float) -> bool:
+    """Returns whether a value is finite, also as a REAL32: what a device holds has to travel on the bus."""
+    return math.isfinite(nearest(value))
+
+
 def same(one: float, other: float) -> bool:
     """True where two values are one REAL32 (24 bits, 6e-8) but for the rounding of a device that converts what it is
     given: equal to TOLERANCE, next to 0 to 1e-9. So what a device was given is compared with what it then holds."""
