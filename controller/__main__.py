@@ -12,7 +12,14 @@ from loopwright.controller.channel import Settings
 from loopwright.controller.device import ControllerChannel, ControllerDevice
 from loopwright.controller.pid import Parameters
 from loopwright.controller.retained_state import RetainedStateError, RetainedStateFile, read_retained_state
-from loopwright.protocol.device_process import DeviceConfigError, node_id, read_channels, run_device
+from loopwright.protocol.device_process import (
+    DeviceConfigError,
+    check_count,
+    node_id,
+    read_channels,
+    run_device,
+    sample_time,
+)
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, Mode
 
 _MODES = {"off": Mode.OFF, "manual": Mode.MANUAL, "automatic": Mode.AUTOMATIC}
@@ -40,9 +47,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         rows = read_channels(options.config, common) if options.config else [{}] * options.channels
         channels = [_channel({**common, **row}) for row in rows]
+        check_count(channels)
         retained = read_retained_state(options.keep, [one.retained for one in channels]) if options.keep else None
         if retained:
             channels = [one.with_retained(own) for one, own in zip(channels, retained, strict=True)]
+        for one in channels:
+            one.make(options.ts)
     except (DeviceConfigError, RetainedStateError, KeyError, TypeError, ValueError) as error:
         print(f"controller: {error.args[0]}", file=sys.stderr)
         return 2
@@ -64,8 +74,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _channel(row: Mapping[str, Any]) -> ControllerChannel:
     numbers = {name: float(row[name]) for name in _NUMBERS}
-    if row["mode"] not in _MODES:
-        raise DeviceConfigError(f"mode {row['mode']!r} is unknown; there are {', '.join(_MODES)}")
+    mode = "off" if row["mode"] is False else row["mode"]  # to YAML the word off is the truth value false
+    if mode not in _MODES:
+        raise DeviceConfigError(f"mode {mode!r} is unknown; there are {', '.join(_MODES)}")
+    if not isinstance(row["direct"], bool):  # any other word would count as true, and turn the action round
+        raise DeviceConfigError(f"direct is {row['direct']!r}: it is true or false")
     return ControllerChannel(
         Parameters(*(numbers[name] for name in ("kp", "ti", "td", "tf", "b", "c"))),
         numbers["sp"],
@@ -78,7 +91,7 @@ def _channel(row: Mapping[str, Any]) -> ControllerChannel:
             pv_high=numbers["pv_high"],
             reverse=not row["direct"],
         ),
-        _MODES[row["mode"]],
+        _MODES[mode],
         numbers["mv"],
     )
 
@@ -89,7 +102,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--channels", type=int, default=1, metavar="N", help="that many, all alike")
     parser.add_argument("--config", metavar="FILE", help="YAML list of channels, with the names of these options (_)")
     parser.add_argument("--keep", type=Path, metavar="FILE", help="keeps gains, mode, set-point over a restart")
-    parser.add_argument("--ts", type=float, default=0.1, metavar="S", help="sample time, process seconds")
+    parser.add_argument("--ts", type=sample_time, default=0.1, metavar="S", help="sample time, process seconds")
     for name, (default, text) in _NUMBERS.items():
         option = f"--{name.replace('_', '-')}"
         parser.add_argument(option, type=float, default=default, metavar="X", help=f"{text} (default {default:g})")

@@ -10,8 +10,16 @@ from collections.abc import Sequence
 from loopwright.plantsim.catalogue import find
 from loopwright.plantsim.device import PlantChannel, PlantDevice
 from loopwright.plantsim.own_plant import own_plant
-from loopwright.protocol.device_process import DeviceConfigError, node_id, read_channels, run_device
+from loopwright.protocol.device_process import (
+    DeviceConfigError,
+    check_count,
+    node_id,
+    read_channels,
+    run_device,
+    sample_time,
+)
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE
+from loopwright.protocol.real32 import fits
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -22,6 +30,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         channels = [_channel(row.get("model", ""), float(row.get("noise", options.noise))) for row in rows]
         if not channels:
             raise DeviceConfigError("no plant given; use --model NAME or --config FILE")
+        check_count(channels)
+        for channel in channels:
+            channel.build(options.ts, channel.noise_std, options.seed)
     except (DeviceConfigError, KeyError, TypeError, ValueError) as error:
         print(f"plantsim: {error.args[0]}", file=sys.stderr)
         return 2
@@ -43,7 +54,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
 
 
-def _channel(model: str, noise_std: float) -> PlantChannel:
+def _channel(model: object, noise_std: float) -> PlantChannel:
+    if not isinstance(model, str):
+        raise DeviceConfigError(f"model is {model!r}: it is a name, or a JSON object in quotation marks")
+    if not (fits(noise_std) and noise_std >= 0.0):
+        raise DeviceConfigError(f"noise is {noise_std:g}: a standard deviation is finite and not negative")
     entry = own_plant(model) if model.lstrip().startswith("{") else find(model)
     return PlantChannel(entry.build, entry.facts.mv_nominal_pct, noise_std)
 
@@ -58,10 +73,10 @@ def _speed(text: str) -> float:
     return factor
 
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0.0001 <= value <= 3600.0:
-        raise argparse.ArgumentTypeError("a sample time is 0.0001 to 3600 s")
+def _seed(text: str) -> int:
+    value = int(text)
+    if not 0 <= value <= 0xFFFFFFFF:
+        raise argparse.ArgumentTypeError("a seed is 0 to 4294967295")
     return value
 
 
@@ -81,10 +96,10 @@ def _parser() -> argparse.ArgumentParser:
         "too",
     )
     parser.add_argument("--config", metavar="FILE", help="YAML list of channels: model, noise")
-    parser.add_argument("--ts", type=_positive, default=0.1, metavar="S", help="sample time, process seconds")
+    parser.add_argument("--ts", type=sample_time, default=0.1, metavar="S", help="sample time, process seconds")
     parser.add_argument("--speed", type=_speed, default=1.0, metavar="FACTOR", help="times real time, or max")
     parser.add_argument("--noise", type=float, default=0.0, metavar="STD", help="measurement noise, PV units")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=_seed, default=1)
     parser.add_argument("--node", type=node_id, default=PLANT_NODE)
     parser.add_argument("--controller-node", type=node_id, default=CONTROLLER_NODE)
     return parser

@@ -240,8 +240,12 @@ class PlantDevice:
     def _write_sample_time(self, sub: int, value: Value) -> None:
         if self.runtime.state is not NmtState.PRE_OPERATIONAL:
             raise SdoAbort(Abort.DEVICE_STATE)
-        self.sample_time_s = int(value) / 1e6
-        self._initialise()
+        before, self.sample_time_s = self.sample_time_s, int(value) / 1e6
+        try:
+            self._initialise()
+        except ValueError:
+            self.sample_time_s = before
+            raise SdoAbort(Abort.INVALID_VALUE) from None
 
     def _write_pace(self, sub: int, value: Value) -> None:
         self.pace = float(value)

@@ -11,6 +11,7 @@ from functools import partial
 from loopwright.plantsim.catalogue import CatalogueModel, Entry, LaterPath, PlantFacts
 from loopwright.plantsim.imperfect import Sine
 from loopwright.plantsim.valves import Backlash, EqualPercentage, Stiction, TwoGains, Valve
+from loopwright.protocol.real32 import fits
 
 MORE = ("second_path", "valve", "sine")
 """Names of what a plant can have besides its transfer function and its operating point."""
@@ -46,6 +47,8 @@ def own_plant(text: str) -> Entry:
     numbers = {name: float(data.get(name, other)) for name, other in (("dead_time_s", 0.0), ("mv", 50.0), ("pv", 50.0))}
     if not 0.0 <= numbers["mv"] <= 100.0:
         raise ValueError(f"mv is {numbers['mv']:g}: MV is in percent, 0 to 100")
+    if not fits(numbers["pv"]):
+        raise ValueError(f"pv is {numbers['pv']:g}: PV is finite, and within the range of a REAL32")
     num, den = (tuple(float(each) for each in data[name]) for name in ("num", "den"))
     if not num or not any(den):
         raise ValueError(f"num and den need coefficients, den one that is not 0, not {text}")

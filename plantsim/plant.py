@@ -16,6 +16,9 @@ import numpy as np
 
 from loopwright.plantsim.models import sampled
 
+LONGEST_DELAY = 10_000_000
+"""Largest dead time, samples: each of them takes 8 bytes."""
+
 
 class SimulatedProcess(Protocol):
     """A process that is simulated sample by sample."""
@@ -68,6 +71,9 @@ class LinearPlant:
         if mv_per_unit == 0:
             raise ValueError("mv_per_unit must not be zero")
         model = sampled(num, den, dead_time_s, sample_time_s)
+        if model.delay > LONGEST_DELAY:
+            text = f"a dead time of {dead_time_s:g} s is more than {LONGEST_DELAY} samples of {sample_time_s:g} s"
+            raise ValueError(text)
         order = len(model.C)
         # The vector is [x, y, u_old, u_new]; one product advances it by one sample.
         matrix = np.zeros((order + 3, order + 3))

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
@@ -15,6 +15,7 @@ import yaml
 
 from loopwright.protocol.bus import Bus, BusError, open_bus
 from loopwright.protocol.device_runtime import Runtime
+from loopwright.protocol.profile import MAX_CHANNELS
 
 
 class DeviceConfigError(Exception):
@@ -37,6 +38,20 @@ def node_id(text: str) -> int:
     return node
 
 
+def sample_time(text: str) -> float:
+    """Parses a sample time, 0.0001..3600 s; raises argparse.ArgumentTypeError."""
+    value = float(text)
+    if not 0.0001 <= value <= 3600.0:
+        raise argparse.ArgumentTypeError("a sample time is 0.0001 to 3600 s")
+    return value
+
+
+def check_count(channels: Sequence[object]) -> None:
+    """Raises DeviceConfigError for more channels than there are COB-IDs for, or none."""
+    if not 1 <= len(channels) <= MAX_CHANNELS:
+        raise DeviceConfigError(f"a device has 1 to {MAX_CHANNELS} channels, not {len(channels)}")
+
+
 def read_channels(path: str, keys: Iterable[str]) -> list[dict[str, Any]]:
     """Reads the list of channels of a YAML file; an unknown key is refused rather than ignored.
 
@@ -44,7 +59,7 @@ def read_channels(path: str, keys: Iterable[str]) -> list[dict[str, Any]]:
     """
     try:
         rows = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise DeviceConfigError(f"{path}: {error}") from error
     if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
         raise DeviceConfigError(f"{path}: a list of channels is expected")

@@ -179,11 +179,18 @@ def _frame(words: list[bytes]) -> bytes | None:
         return None
 
 
+def _port(text: str) -> int:
+    port = int(text)
+    if not 0 <= port <= 65535:
+        raise argparse.ArgumentTypeError("a port is 0 to 65535")
+    return port
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m loopwright.protocol.hub", description="A CAN bus on 127.0.0.1, without CAN."
     )
-    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="0 takes any free one (default: %(default)s)")
+    parser.add_argument("--port", type=_port, default=DEFAULT_PORT, help="0 takes any free one (default: %(default)s)")
     try:
         hub = Hub(parser.parse_args(argv).port)
     except OSError as error:
