@@ -373,8 +373,9 @@ class ControllerDevice:
             session.heard(node, now)
 
     def _on_leave_operational(self) -> None:
-        for at, session in enumerate(self.sessions):
+        for session in self.sessions:  # all of them before a frame, which the bus may not take
             session.end(Cause.NMT, operational=False)
+        for at in range(len(self.sessions)):
             self._report_if_new(at)
             self._send_unasked(at)
 

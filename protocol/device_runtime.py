@@ -180,11 +180,13 @@ class Runtime:
     def _enter(self, state: NmtState) -> None:
         if state is self.state:
             return
-        if self.state is NmtState.OPERATIONAL:
-            self.on_leave_operational()  # first, because it may send a last PDO
-        self.state = state
-        self.gate()
-        self._own_beat.restart()
+        try:
+            if self.state is NmtState.OPERATIONAL:
+                self.on_leave_operational()  # first, because it may send a last PDO
+        finally:  # the command holds also where the bus does not take that PDO
+            self.state = state
+            self.gate()
+            self._own_beat.restart()
 
     def gate(self) -> None:
         """Activates PDOs in operational only, and SDO in every state but stopped."""
