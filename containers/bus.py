@@ -85,16 +85,18 @@ async def _forward(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -
     except OSError:  # the service is starting
         writer.close()
         return
-    await asyncio.gather(_copy(reader, inner_writer), _copy(inner_reader, writer))
+    await asyncio.gather(copy(reader, inner_writer), copy(inner_reader, writer))
 
 
-async def _copy(source: asyncio.StreamReader, target: asyncio.StreamWriter) -> None:
+async def copy(source: asyncio.StreamReader, target: asyncio.StreamWriter) -> None:
     """Ends the other side when one side ends: an event stream that a browser closes must not stay open inside."""
-    with suppress(ConnectionError):
-        while data := await source.read(_CHUNK):
-            target.write(data)
-            await target.drain()
-    target.close()
+    try:
+        with suppress(OSError):  # a caller that vanishes ends as a time-out, or as a host that is not reached
+            while data := await source.read(_CHUNK):
+                target.write(data)
+                await target.drain()
+    finally:
+        target.close()
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import signal
 import socket
 import subprocess
@@ -9,10 +10,11 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 
-from loopwright.containers import keeper
+from loopwright.containers import bus, keeper
 from loopwright.protocol.bus import open_bus
 
 # The kernel's answers to the first netlink message, wherever the test runs.
@@ -107,3 +109,11 @@ def test_the_door_leads_to_the_service_once_there_is_one() -> None:
                 assert caller.recv(100) == b"GET"
                 assert caller.recv(1) == b""  # the service has hung up
             serving.join()
+
+
+@pytest.mark.parametrize("error", [TimeoutError(110, "timed out"), OSError(113, "no route"), ConnectionResetError()])
+def test_a_caller_that_vanishes_leaves_no_connection_to_the_service(error: OSError) -> None:
+    caller, inner = Mock(), Mock()
+    caller.read = AsyncMock(side_effect=error)
+    asyncio.run(bus.copy(caller, inner))
+    inner.close.assert_called_once_with()
