@@ -15,6 +15,7 @@ from loopwright.controller.retained_state import RetainedStateError, RetainedSta
 from loopwright.protocol.device_process import (
     DeviceConfigError,
     check_count,
+    check_nodes,
     node_id,
     read_channels,
     run_device,
@@ -48,6 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         rows = read_channels(options.config, common) if options.config else [{}] * options.channels
         channels = [_channel({**common, **row}) for row in rows]
         check_count(channels)
+        check_nodes(options.node, options.plant_node)
         retained = read_retained_state(options.keep, [one.retained for one in channels]) if options.keep else None
         if retained:
             channels = [one.with_retained(own) for one, own in zip(channels, retained, strict=True)]

@@ -13,6 +13,7 @@ from loopwright.plantsim.own_plant import own_plant
 from loopwright.protocol.device_process import (
     DeviceConfigError,
     check_count,
+    check_nodes,
     node_id,
     read_channels,
     run_device,
@@ -31,6 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not channels:
             raise DeviceConfigError("no plant given; use --model NAME or --config FILE")
         check_count(channels)
+        check_nodes(options.controller_node, options.node)
         for channel in channels:
             channel.build(options.ts, channel.noise_std, options.seed)
     except (DeviceConfigError, KeyError, TypeError, ValueError) as error:

@@ -15,7 +15,7 @@ import yaml
 
 from loopwright.protocol.bus import Bus, BusError, open_bus
 from loopwright.protocol.device_runtime import Runtime
-from loopwright.protocol.profile import MAX_CHANNELS
+from loopwright.protocol.profile import MAX_CHANNELS, node_name
 
 
 class DeviceConfigError(Exception):
@@ -44,6 +44,12 @@ def sample_time(text: str) -> float:
     if not 0.0001 <= value <= 3600.0:
         raise argparse.ArgumentTypeError("a sample time is 0.0001 to 3600 s")
     return value
+
+
+def check_nodes(controller: int, plant: int) -> None:
+    """Raises DeviceConfigError where two devices on one bus would have one node-ID."""
+    if controller == plant:
+        raise DeviceConfigError(f"the controller and its plant have the node-ID {node_name(plant)} both")
 
 
 def check_count(channels: Sequence[object]) -> None:

@@ -49,6 +49,7 @@ class TestController:
             (("--sp", "nan"), "values must be finite"),
             (("--sp", "1e39"), "range of a REAL32"),
             (("--kp", "1e39"), "range of a REAL32"),
+            (("--node", "0x10"), "have the node-ID 10h (16) both"),
             (("--channels", "0"), "1 to 199 channels, not 0"),
             (("--channels", "200"), "1 to 199 channels, not 200"),
         ],
@@ -91,6 +92,7 @@ class TestPlant:
             (("--model", '{"num": [1], "den": [1, 1], "dead_time_s": 1e12}'), "more than 10000000 samples"),
             (("--model", '{"num": [1], "den": [1, 1], "pv": 1e39}'), "pv is 1e+39"),
             (("--model", '{"num": [1], "den": [1, 1], "pv": NaN}'), "pv is nan"),
+            (("--model", "fopdt", "--node", "32"), "have the node-ID 20h (32) both"),
             (("--model", "fopdt") * 200, "1 to 199 channels, not 200"),
         ],
     )
