@@ -50,6 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         channels = [_channel({**common, **row}) for row in rows]
         check_count(channels)
         check_nodes(options.node, options.plant_node)
+        if options.keep and not options.keep.parent.is_dir():
+            raise DeviceConfigError(f"--keep {options.keep}: there is no folder {options.keep.parent}")
         retained = read_retained_state(options.keep, [one.retained for one in channels]) if options.keep else None
         if retained:
             channels = [one.with_retained(own) for one, own in zip(channels, retained, strict=True)]

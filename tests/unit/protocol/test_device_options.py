@@ -50,6 +50,7 @@ class TestController:
             (("--sp", "1e39"), "range of a REAL32"),
             (("--kp", "1e39"), "range of a REAL32"),
             (("--node", "0x10"), "have the node-ID 10h (16) both"),
+            (("--keep", "/nowhere/kept.json"), "there is no folder /nowhere"),
             (("--channels", "0"), "1 to 199 channels, not 0"),
             (("--channels", "200"), "1 to 199 channels, not 200"),
         ],
