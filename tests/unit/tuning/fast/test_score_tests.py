@@ -35,9 +35,9 @@ def test_a_linear_plant_is_not_told_to_be_another(name: str, seed: int) -> None:
     fit = Fit(pulse_record(*LOOPS[name], noise=0.01, seed=seed))
     linearity = ScoreTests(fit, choose_structure(fit).best)
     assert linearity.nonlinearity() is None
-    for changed in (above_rest, squared, cubed):
+    for changed, known_to in ((above_rest, 0.1), (squared, 0.1), (cubed, 0.2)):
         size, deviation = linearity.score(changed)
-        assert abs(size) < 4.0 * deviation and deviation < 0.1
+        assert abs(size) < 4.0 * deviation and deviation < known_to
     for alternative in CHANGING_WITH_PV:
         size, deviation = linearity.score_in_pv(alternative.changed)
         assert abs(size) < 4.0 * deviation
