@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any
 
 import pytest
@@ -22,6 +22,8 @@ from loopwright.service.listening.rings import Rings
 from loopwright.service.observing.hearing import question
 from loopwright.service.results import FindingSource, GainsView
 from loopwright.service.store import knowledge
+from loopwright.service.store.clock import stamp
+from loopwright.service.store.job_rows import find
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.gains import Gains
@@ -150,7 +152,10 @@ def test_changes_during_a_test_are_no_operation(service: Service) -> None:
 
 def test_a_test_that_a_clock_set_back_makes_later_than_its_acceptance_does_not_count(service: Service) -> None:
     begun_s = time.time()
-    service.wait(service.jobs.start(TAG, FastRetune()).id)
+    job_id = service.jobs.start(TAG, FastRetune()).id
+    service.wait(job_id)
+    with service.store.writing() as session:  # it has lasted as long as some samples
+        find(session, job_id).started_at = stamp(datetime.fromtimestamp(begun_s - 1.0, UTC))
     rings, state = LOOP.heard(MOVES, 3800, begun_s + 200.0), replace(service.controller.state, sample_time_s=LOOP.Ts)
     at = service.store, service.loops[TAG], state, DesignSpec(), (), lambda: begun_s + 200.0
     assert len(question(HeardBefore(rings), *at).heard()) == 2
