@@ -25,7 +25,7 @@ from loopwright.tuning.models import FOPDT
 from loopwright.tuning.operation.known import known_plant
 from loopwright.tuning.operation.observation import observe
 from tests.rehearsal.test_observe import ASKED, operated
-from tests.rehearsal.test_resumed_jobs import TAG, Mortal, MortalEngine
+from tests.rehearsal.test_resumed_jobs import COMPUTED_WITHIN_S, TAG, Mortal, MortalEngine
 from tests.unit.service.observing.findings import finding
 
 PLANT = FOPDT(2.0, 6.0, 1.5)
@@ -68,12 +68,12 @@ class Ran:
         self.jobs.start(TAG, retune_request(**options))
 
     def dead(self) -> None:
-        assert self.engine.dead.wait(60) and self.jobs.journal.flush(10)
+        assert self.engine.dead.wait(COMPUTED_WITHIN_S) and self.jobs.journal.flush(10)
         self.jobs.stop_watching()
         self.store.close()
 
     def finished(self) -> tuple[Job, list[str]]:
-        self.engine.join(120)
+        self.engine.join(COMPUTED_WITHIN_S)
         row = self.store.recent()[0]
         ran = [begun.stage for event in self.store.events(row.id) if (begun := event.stage_begun())]
         self.jobs.stop()
