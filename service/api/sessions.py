@@ -110,8 +110,8 @@ def router(store: Store, checks: KeyChecks | None, open_sessions: BrowserSession
         token, begun = open_sessions.begin(row.id, row.name, Scope(row.scope))
         scheme = request.scope["scheme"]
         response.set_cookie(
-            cookie_name(scheme), token, max_age=int(LASTS_S), path="/", secure=scheme == "https", httponly=True,
-            samesite="strict",
+            cookie_name(request.headers, scheme), token, max_age=int(LASTS_S), path="/", secure=scheme == "https",
+            httponly=True, samesite="strict",
         )  # fmt: skip
         return view(who, begun.csrf)
 
@@ -125,7 +125,7 @@ def router(store: Store, checks: KeyChecks | None, open_sessions: BrowserSession
         open_sessions.end(who.session)
         scheme = request.scope["scheme"]
         response.delete_cookie(
-            cookie_name(scheme), path="/", secure=scheme == "https", httponly=True, samesite="strict"
+            cookie_name(request.headers, scheme), path="/", secure=scheme == "https", httponly=True, samesite="strict"
         )
         try:
             _write(store, who, "sign_out", who.key_id, {"name": who.name})

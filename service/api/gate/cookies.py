@@ -1,11 +1,13 @@
 """The cookie of a browser's session, and what a request that comes with it must show before it changes anything.
 
 Cookies know no ports: a page of another service on this host is of the same site, and SameSite does not keep it out.
+The name of the cookie has the port, so that signing in to another service on this host leaves the session of this one.
 """
 
 from __future__ import annotations
 
 import hmac
+import re
 
 from starlette.datastructures import Headers
 from starlette.requests import cookie_parser
@@ -14,15 +16,20 @@ CSRF_HEADER = "X-Loopwright-CSRF"
 _NAME = "loopwright_session"
 
 
-def cookie_name(scheme: str) -> str:
-    """The prefix lets a browser take the cookie over TLS only, and from this host only."""
-    return f"__Host-{_NAME}" if scheme == "https" else _NAME
+def cookie_name(headers: Headers, scheme: str) -> str:
+    """The name of the cookie under the address that the browser has asked.
+
+    The prefix lets a browser take the cookie over TLS only, and from this host only.
+    """
+    port = re.search(r":([0-9]{1,5})$", headers.get("host", ""))
+    name = f"{_NAME}_{port[1]}" if port else _NAME
+    return f"__Host-{name}" if scheme == "https" else name
 
 
 def token_of(headers: Headers, scheme: str) -> str | None:
     """The token of the session in the request's cookies; None: there is none."""
     for line in headers.getlist("cookie"):
-        if token := cookie_parser(line).get(cookie_name(scheme)):
+        if token := cookie_parser(line).get(cookie_name(headers, scheme)):
             return token
     return None
 

@@ -156,6 +156,18 @@ def test_signing_out(browsers: Browsers) -> None:
     assert {each.who for each in browsers.trail()} == {"control room"}
 
 
+@pytest.mark.parametrize("scheme", ["http", "https"])
+def test_two_services_on_one_host(browsers: Browsers, scheme: str) -> None:
+    """A browser sends the cookies of a host to each of its ports."""
+    one, other = (browsers.browser(scheme) for _ in range(2))
+    one.base_url, other.base_url, other.cookies = f"{scheme}://{HOST}:8000", f"{scheme}://{HOST}:8001", one.cookies
+    _, key = browsers.keyring.create("control room", Scope.OPERATE)
+    said = [browser.post("/session", json={"key": key}).json()["csrf"] for browser in (one, other)]
+    assert [browser.get("/session").json()["csrf"] for browser in (one, other)] == said
+    assert other.delete("/session", headers={CSRF: said[1]}).status_code == 204
+    assert (other.get("/session").status_code, one.get("/session").status_code) == (401, 200)
+
+
 def test_a_restart_signs_out(browsers: Browsers) -> None:
     browser = browsers.signed_in()
     browsers.sessions = BrowserSessions()
@@ -183,7 +195,7 @@ def test_a_revoked_key_and_a_sign_out_end_sessions_and_streams(
     token, session = browsers.sessions.begin(row.id, row.name, Scope.READ)
     with (
         screens_of(service, Policy(browsers.keyring, sessions=browsers.sessions)) as screens,
-        viewing(screens.base, Cookie=f"loopwright_session={token}") as viewer,
+        viewing(screens.base, Cookie=f"loopwright_session_{screens.base.rpartition(':')[2]}={token}") as viewer,
     ):
         viewer.until("hello")
         if sign_out:
