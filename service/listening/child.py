@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -66,6 +67,10 @@ class Clock:
         if abs(ahead_s) > _JUMP_S:
             self._offset -= ahead_s
         return ahead_s > _JUMP_S
+
+    def of(self, wall_s: float) -> float:
+        """Returns this clock's time at a recent time of the wall clock, which is up to a jump away."""
+        return wall_s + self.now() - self._wall()
 
 
 class HeardBus:
@@ -137,8 +142,8 @@ class HeardBus:
 
     def new_frames(self) -> int:
         """Returns the number of frames of process data since this was asked last."""
-        frames, self._reported = self._frames - self._reported, self._frames
-        return frames
+        before, self._reported = self._reported, self._frames
+        return self._reported - before
 
 
 class Child:
@@ -200,8 +205,9 @@ class Child:
 
     def learn(self, message: Learn) -> None:
         bus = self._of_tag[message.tag]
+        found = replace(message.found, began_s=self._clock.of(message.found.began_s))
         with bus.lock:
-            bus.loops[message.tag].learn(message.found, self._clock.now())
+            bus.loops[message.tag].learn(found, self._clock.now())
 
     def watch(self, message: Watch) -> None:
         told = {}

@@ -11,7 +11,7 @@ import pytest
 
 from loopwright.protocol.bus import BusError, Frame
 from loopwright.protocol.bus_state import BusState
-from loopwright.protocol.profile import MV_FRAME, PV_FRAME, Mode, NmtState, channel_ids
+from loopwright.protocol.profile import MV_FRAME, PV_FRAME, STATUS_FRAME, Mode, NmtState, channel_ids
 from loopwright.service.listening import child as module
 from loopwright.service.listening.bins import unpacked
 from loopwright.service.listening.child import BLOCK_S, Child, Clock
@@ -144,6 +144,18 @@ def test_loops_that_are_heard_and_not_read_are_named(child: Child, time: Time) -
     take(child, "B", 1)
     report = child.report()
     assert report.to_read == ["B"] and report.frames == {URL: 2}
+
+
+def test_a_reading_from_before_a_change_is_dropped_whatever_the_clocks_say(child: Child, time: Time) -> None:
+    """The wall clock is slewed away from the clock of the samples by less than a jump."""
+    take(child, "A", 1)
+    time.wall += 0.09
+    began_s = time.wall
+    time.pass_by(0.05)
+    child.buses[URL].take(IDS["A"].status, STATUS_FRAME.pack(Mode.AUTOMATIC, 0, 50.0, 0, 0))
+    time.pass_by(0.01)
+    child.learn(Learn("A", InEffect(began_s, 50.0, Mode.AUTOMATIC, False, (1.0,) * 6)))
+    assert child.report().to_read == ["A"]
 
 
 def test_bins_are_handed_over_once_in_blocks_that_follow_each_other(child: Child, time: Time) -> None:
