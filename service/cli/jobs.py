@@ -21,6 +21,7 @@ from loopwright.service.cli.output import (
     print_json,
 )
 from loopwright.service.cli.tuning import check_plot
+from loopwright.service.cli.whole_file import written_whole
 from loopwright.service.states.job_state import JobState
 
 if TYPE_CHECKING:
@@ -206,7 +207,8 @@ def report_of_job(
     if output is None and file.exists():
         die(f"{file} exists already: name another file with --output, or the same to replace it", 2)
     try:
-        file.write_text(text, encoding="utf-8")
+        with written_whole(file) as new:
+            new.write_text(text, encoding="utf-8")
     except OSError as error:
         die(f"{file}: {error.strerror}", 2)
     print(file)

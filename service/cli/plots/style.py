@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from loopwright.service.cli.whole_file import written_whole
 from loopwright.tuning.models import Reals
 
 BEFORE, AFTER, MEASURED, SETPOINT, MV, LOAD, OTHER = (
@@ -41,8 +42,8 @@ def new_figure(width: float, height: float) -> Figure:
 def write(figure: Figure, path: Path) -> None:
     """Writes a figure to a file in the format of its suffix, the same bytes for the same figure. Raises OSError."""
     undated = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-    with rc_context({"svg.hashsalt": "loopwright"}):
-        figure.savefig(path, dpi=DPI, metadata=undated.get(path.suffix.lower()))
+    with written_whole(path) as new, rc_context({"svg.hashsalt": "loopwright"}):
+        figure.savefig(new, dpi=DPI, metadata=undated.get(path.suffix.lower()))
 
 
 def plain(axes: Axes, y: str = "", x: str = "") -> None:
