@@ -284,6 +284,22 @@ class TestStream:
         page.clock.run_for(600)  # less than what is a silence
         assert pv.text_content() == person.DASH
 
+    def test_a_further_window_loads_beside_many_that_nobody_sees(self, site: SimulatedSite, pages: Pages) -> None:
+        """A browser makes six connections to a service, and the stream of each window takes one."""
+        context = pages.context()
+        context.clock.install()
+        context.clock.pause_at(time.time() + 1.0)  # no window has been hidden for a minute
+        site.service.under_test()
+        windows: list[Page] = []
+        for _ in range(9):
+            for page in windows[-1:]:
+                page.evaluate(HIDE, True)
+            windows.append(pages.another(context, LOOP))
+            expect(person.abort_button(windows[-1])).to_be_enabled()  # the stream says that a test runs
+        with windows[0].expect_request("**/live*"):
+            windows[0].evaluate(HIDE, False)
+        expect(person.abort_button(windows[0])).to_be_enabled()
+
     def test_the_count_of_what_is_abnormal_goes_on_in_a_tab_that_nobody_sees(
         self, site: SimulatedSite, pages: Pages
     ) -> None:

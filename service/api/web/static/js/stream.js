@@ -6,6 +6,7 @@ import { ask, crowded, signedOut } from "./api.js";
 import {
   alarms, buses, forgetRows, jobs, newerVersion, now_s, clock_s, refreshLoops, service, setClock, silent_s, takeRows,
 } from "./state.js";
+import { Windows } from "./windows.js";
 
 const SILENT_S = 2.5;
 /** A stream that is open and has said nothing for so long is opened anew: its connection may be dead, which nobody says. */
@@ -39,6 +40,12 @@ class Stream {
     this.differing = "";
     /** Counts how often the stream was opened. */
     this.opened = 0;
+    this.windows = new Windows(
+      () => this.source !== null && !this.given_up,
+      () => {
+        if (document.hidden && !this.stays) this.giveUp();
+      },
+    );
   }
 
   begin() {
@@ -75,6 +82,7 @@ class Stream {
     this.opened_ms = performance.now();
     const source = new EventSource(`/live${query}`);
     this.source = source;
+    this.windows.opened();
     /** @param {string} name @param {(found: any) => void} take */
     const on = (name, take) =>
       source.addEventListener(name, (event) => {
@@ -137,7 +145,7 @@ class Stream {
       } catch {
         // The stream says more.
       }
-      if (!signedOut.value) this.open();
+      if (!signedOut.value && !this.given_up) this.open();
     }, wait_s * 1000);
   }
 
@@ -160,16 +168,20 @@ class Stream {
     }
   }
 
+  /** Gives the stream up until the page is seen again. */
+  giveUp() {
+    this.given_up = true;
+    this.away = true;
+    this.source?.close();
+    clearTimeout(this.retry);
+    forgetRows(); // what is shown first when the page is seen again is not what was heard long ago
+  }
+
   seen() {
     clearTimeout(this.hidden);
     if (document.hidden) {
       this.hidden = setTimeout(() => {
-        if (this.stays) return;
-        this.given_up = true;
-        this.away = true;
-        this.source?.close();
-        clearTimeout(this.retry);
-        forgetRows(); // what is shown first when the page is seen again is not what was heard long ago
+        if (!this.stays) this.giveUp();
       }, HIDDEN_S * 1000);
     } else if (this.given_up) {
       this.given_up = false;
