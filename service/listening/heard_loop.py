@@ -94,11 +94,13 @@ class HeardLoop:
         n, pv, mv = sample
         silence_s = at_s - self._heard_s
         passed = 0 if self._last_n is None else samples_between(self._last_n, n)
+        if passed == 1 and not self._period_s:
+            self._period_s = silence_s
         gap = passed != 1 or silence_s > max(SILENCE_S, 3.0 * self._period_s)
         if gap:
             self._forget(at_s)
-        else:
-            self._period_s += 0.125 * (silence_s - self._period_s)
+        if passed == 1:  # at most doubled: a single silence is no period
+            self._period_s += min(0.125 * (silence_s - self._period_s), self._period_s)
         self._last_n, self._heard_s = n, at_s
         self.rings.put(at_s, n, pv, mv, self._sp, self._gains, self._mode, GAP_BEFORE if gap else 0)
 

@@ -113,6 +113,28 @@ def test_a_slow_loop_has_no_gaps(bus: Bus) -> None:
     assert bus.loop.silent_from_s(bus.at_s + 4.0 * SILENCE_S) == bus.at_s
 
 
+@pytest.mark.parametrize("period_s", [SILENCE_S + 0.1, 30.0, 600.0])
+def test_a_loop_whose_samples_are_farther_apart_than_a_silence_is_heard(bus: Bus, period_s: float) -> None:
+    bus.sample(1)
+    for n in range(2, 20):
+        bus.sample(n, seconds=period_s)
+        if bus.loop.to_read(bus.at_s):
+            bus.read()
+    assert not bus.gaps and bus.bins["gains"][-1]
+    assert bus.loop.silent_from_s(bus.at_s + 2.0 * period_s) == math.inf
+    assert bus.loop.silent_from_s(bus.at_s + 4.0 * period_s) < math.inf
+
+
+def test_a_loop_that_is_made_slower_is_heard_again_and_a_single_silence_makes_none_slow(bus: Bus) -> None:
+    for n in range(1, 60):
+        bus.sample(n)
+    bus.sample(60, seconds=3600.0)
+    assert bus.loop.silent_from_s(bus.at_s + SILENCE_S + 0.1) == bus.at_s
+    for n in range(61, 160):
+        bus.sample(n, seconds=30.0)
+    assert not bus.bins["gap"][-80:].any() and bus.loop.silent_from_s(bus.at_s + 60.0) == math.inf
+
+
 def test_a_bus_that_was_away_is_a_gap(bus: Bus) -> None:
     bus.sample(1)
     bus.sample(2)
