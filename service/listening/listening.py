@@ -207,6 +207,10 @@ class Listening:
                     continue
                 if last_s is not None and block.after_s != last_s:
                     rows.bins["gap"][0] |= GAP_BEFORE
+                if last_s is not None and block.first_s <= last_s:  # the clock was put back: this time was heard twice
+                    rows = _later(rows, last_s)
+                if not len(rows.bins):
+                    continue
                 each.append(rows)
                 last_s = block.last_s
             if not each:
@@ -291,6 +295,13 @@ def _nodes(loops: Mapping[str, LoopConfig], off: Collection[str]) -> dict[str, s
             named = (loop.controller_node, loop.plant_node)
             found.setdefault(loop.bus, set()).update(node for node in named if node is not None)
     return found
+
+
+def _later(rows: Rows, than_s: float) -> Rows:
+    """Returns the bins that begin later than this time, after a gap."""
+    bins = rows.bins[rows.bins["at_s"] > than_s]
+    bins["gap"][:1] |= GAP_BEFORE
+    return Rows(bins, rows.sets)
 
 
 def _whole(stored: list[Rows], answer: HistoryAnswer | None, from_s: float, to_s: float, points: int) -> Rows:

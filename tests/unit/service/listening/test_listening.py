@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from loopwright.service.inputs.config import LoopConfig, parse_site
-from loopwright.service.listening.bins import GAP_BEFORE, Rows, packed
+from loopwright.service.listening.bins import GAP_BEFORE, Rows, packed, unpacked
 from loopwright.service.listening.heard_loop import InEffect
 from loopwright.service.listening.listening import HOLE_S, NOT_BEGUN, Listening
 from loopwright.service.listening.messages import HistoryAnswer
@@ -92,6 +92,30 @@ def test_a_damaged_block_is_a_gap(listening: Listening, store: Store, caplog: py
     found = listening.history(TAG, T0, T0 + 179.0, 5000).rows
     assert found.gaps == ((pytest.approx(T0 + 59.9), pytest.approx(T0 + 120.0)),)
     assert "damaged" in caplog.text
+
+
+@pytest.mark.parametrize("back_s", [0.5, 31.0, 170.0])
+@pytest.mark.parametrize("points", [3, 20, 5000])
+def test_a_time_that_was_heard_twice_since_the_clock_was_put_back_is_there_once(
+    listening: Listening, store: Store, back_s: float, points: int
+) -> None:
+    history.write(store, [block(n, first=n == 0) for n in range(5)])
+    history.write(store, [put_back(block(n, first=n == 5), back_s) for n in range(5, 9)])
+    found = listening.history(TAG, T0, T0 + 600.0, points).rows
+    assert len(found.bins) <= points
+    assert (found.bins["at_s"][1:] > found.bins["until_s"][:-1]).all()
+    assert all(begin < end for begin, end in found.gaps)
+    apart = found.bins["n"][1:] != found.bins["n"][:-1] + found.bins["count"][:-1]
+    assert points < 5000 or (found.bins["gap"][1:][apart] & GAP_BEFORE).all(), "no line is drawn from one to the other"
+
+
+def put_back(one: HistoryBlock, back_s: float) -> HistoryBlock:
+    """A block as heard by a clock that was put back."""
+    rows = unpacked(one.data, one.count)
+    for name in ("at_s", "until_s"):
+        rows.bins[name] -= back_s
+    first_s, last_s = one.first_s - back_s, one.last_s - back_s
+    return replace(one, after_s=one.after_s and one.after_s - back_s, first_s=first_s, last_s=last_s, data=packed(rows))
 
 
 def test_a_loop_that_falls_silent_has_a_gap_at_the_end(listening: Listening, monkeypatch: pytest.MonkeyPatch) -> None:
