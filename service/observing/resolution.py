@@ -53,8 +53,9 @@ def resolution(bins: Bins, samples_in_t95: float) -> Resolution | None:
         return None
     kept, now_s = round((1.0 - _EDGE) * SAMPLES), float(bins["until_s"][-1])
     later = np.cumsum(bins["count"][::-1].astype(np.int64))[::-1]  # samples from each row on
-    # by the samples heard and not by their period, which is no constant on a simulated plant
-    found = [(1, kept, float(bins["at_s"][min(int(np.argmax(later <= kept)), len(bins) - 1)]))]
+    # by the samples heard and not by their period, which is no constant on a simulated plant; before the bins by it
+    from_s = float(bins["at_s"][min(int(np.argmax(later <= kept)), len(bins) - 1)])
+    found = [(1, kept, from_s - period_s * max(0, kept - int(later[0])))]
     for width_s, size in LEVELS:
         count, rows = round(width_s / period_s), round((1.0 - _EDGE) * size)
         if MIN_OF_BIN <= count <= COARSEST * samples_in_t95:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from loopwright.service.listening.bins import GAP_BEFORE, SAMPLE, Bins, Rows, merged, of_samples
-from loopwright.service.observing.resolution import resolution, wall_period_s
+from loopwright.service.observing.resolution import FIRST_S, resolution, wall_period_s
 from loopwright.service.observing.stretches import heard_stretches
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.gains import Gains
@@ -108,6 +108,16 @@ def test_what_is_read_reaches_back_far_enough_and_is_fine_enough() -> None:
     assert back_s(5.0, 400.0) == (pytest.approx(22.8 * 3600.0, rel=0.01), 6), "a bin of 32 s has 6 samples or 7"
     assert back_s(5.0, 100.0)[1] == 1
     assert resolution(of_samples(rows(0)), 90.0) is None
+
+
+@pytest.mark.parametrize(("period_s", "back_h"), [(0.1, 0.3167), (1.0, 3.167), (5.0, 15.83), (30.0, 95.0)])
+def test_slow_samples_are_looked_at_beyond_the_time_that_is_read_first(period_s: float, back_h: float) -> None:
+    samples = rows(20_000)
+    samples["at_s"] = period_s * np.arange(20_000)
+    now_s = float(samples["at_s"][-1])
+    found = resolution(of_samples(samples[samples["at_s"] >= now_s - FIRST_S]), 90.0)
+    assert found is not None and found.together == 1
+    assert now_s - found.from_s == pytest.approx(3600.0 * back_h, rel=0.01)
 
 
 def test_samples_that_came_more_slowly_for_a_while_are_read_all() -> None:
