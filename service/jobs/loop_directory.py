@@ -121,14 +121,13 @@ class LoopDirectory:
     def in_effect(self, tag: str) -> InEffect | None:
         """Returns what is in effect on a loop of this host, for its history: from the job that has the loop, else from
         the bus; None while that job has not read it yet. Raises Ended."""
-        began_s = time.time()
         for running in self._registry.running.copy().values():
-            if running.tag == tag and running.loop is not None:
-                state = running.loop.latest
+            if running.tag == tag and (loop := running.loop) is not None:
+                began_s, state = loop.began_s, loop.latest
                 if state is None:
                     return None
                 return InEffect(began_s, state.sp, state.mode, state.on_trial, astuple(state.gains))
-        state = self.read(tag)
+        began_s, state = time.time(), self.read(tag)
         gains = None if state.on_trial else astuple(state.gains)  # those that another tuner tries are not read
         return InEffect(began_s, state.sp, state.mode, state.on_trial, gains)
 

@@ -180,6 +180,7 @@ class Worker:
             )  # fmt: skip
             return self._tune(config, request, loop, state, hooks)
         finally:
+            running.loop = None  # what it was at the end is not what it is while the end waits for the database
             loop.close()
 
     def _plant_known(

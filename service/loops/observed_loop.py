@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -13,10 +14,14 @@ from loopwright.tuning.reasons import Reason
 
 
 class ObservedLoop:
-    """Passes all calls on to a loop. Other threads read `latest`: it is replaced as a whole, never changed."""
+    """Passes all calls on to a loop. Other threads read `latest`: it is replaced as a whole, never changed.
 
-    def __init__(self, loop: Loop) -> None:
-        self._loop = loop
+    began_s: wall time at which the call began that has found `latest`, or one before; to be read before it.
+    """
+
+    def __init__(self, loop: Loop, wall: Callable[[], float] = time.time) -> None:
+        self._loop, self._wall = loop, wall
+        self.began_s = 0.0
         self._state: LoopState | None = None
         self._trial: Gains | None = None
         self._sample: Sample | None = None
@@ -43,7 +48,9 @@ class ObservedLoop:
         return self._loop.waits
 
     def read(self, beside_tests: bool = False) -> LoopState:
+        began_s = self._wall()
         self._state = self._loop.read(beside_tests)
+        self.began_s = began_s
         return self._state
 
     def begin(
@@ -51,19 +58,25 @@ class ObservedLoop:
         stop: Callable[[], Reason | None] = lambda: None,
         note_session: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
+        began_s = self._wall()
         self._state = self._loop.begin(stop, note_session)
+        self.began_s = began_s
         return self._state
 
     def step(self, commands: Sequence[Command]) -> Sample:
+        began_s = self._wall()
         self._sample = sample = self._loop.step(commands)
         for command in commands:
             if isinstance(command, SetGains):
                 self._trial = command.gains
+        self.began_s = began_s
         return sample
 
     def restore(self, home: LoopState, session: int | None = None) -> Restored:
+        began_s = self._wall()
         restored = self._loop.restore(home, session)
         self._trial, self._sample, self._state = None, None, restored.state
+        self.began_s = began_s
         return restored
 
     def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
