@@ -263,17 +263,22 @@ def source_text(finding: Finding) -> str:
     return f"{by_operation}, {tried}" if finding.changes is not None else f"a test, {tried}"
 
 
+def best(findings: Sequence[Known], gains: Gains) -> Known:
+    """The one of these findings that knows Ms of the gains best, the latest of several; oldest first."""
+    return min(reversed(findings), key=lambda each: _uncertainty(each.finding, gains))
+
+
 def known(findings: Sequence[Known], gains: Gains | None) -> KnowledgeView | None:
     """What is known of a loop; None where nothing is.
 
     findings: oldest first.
     gains: the gains in effect; None: those of the latest finding.
     """
-    valid = [each.finding for each in findings if each.older_plant is None]
+    valid = [each for each in findings if each.older_plant is None]
     if not valid:
         return None
-    gains = gains or valid[-1].present.gains.gains()
-    finding = min(reversed(valid), key=lambda each: _uncertainty(each, gains))
+    gains = gains or valid[-1].finding.present.gains.gains()
+    finding = best(valid, gains).finding
     found = Ms_of(finding, gains)
     proposed = finding.proposed
     if proposed is not None and same_gains(proposed.gains.gains(), gains):

@@ -12,7 +12,7 @@ from loopwright.service.store.store import Store
 from loopwright.service.store.tables import KnowledgeRow, LoopRow
 
 MAX_OF_A_LOOP = 20
-"""Findings that are kept of a loop, the latest ones."""
+"""Findings that are kept of a loop, the latest ones, beside the one that is what is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,11 +31,19 @@ def read(store: Store, loop: str) -> list[Known]:
         return [Known(row.number, row.finding, row.older_plant) for row in session.scalars(wanted)]
 
 
-def add(store: Store, loop: str, finding: Finding, older: Mapping[int, str], instead_of: Sequence[int] = ()) -> None:
+def add(
+    store: Store,
+    loop: str,
+    finding: Finding,
+    older: Mapping[int, str],
+    instead_of: Sequence[int] = (),
+    best: int | None = None,
+) -> None:
     """Stores a finding.
 
     older: by number, the findings that are of an older plant because of it, with the reason.
     instead_of: the findings that it takes the place of.
+    best: the finding that is kept although many are later.
     """
     of_loop = KnowledgeRow.loop == loop
     with store.writing() as session:
@@ -45,7 +53,8 @@ def add(store: Store, loop: str, finding: Finding, older: Mapping[int, str], ins
         session.add(KnowledgeRow(loop=loop, at=finding.at, finding=finding))
         session.flush()
         latest = select(KnowledgeRow.number).where(of_loop).order_by(KnowledgeRow.number.desc()).limit(MAX_OF_A_LOOP)
-        session.execute(delete(KnowledgeRow).where(of_loop, KnowledgeRow.number.not_in(latest)))
+        superfluous = (of_loop, KnowledgeRow.number.not_in(latest), KnowledgeRow.number.is_distinct_from(best))
+        session.execute(delete(KnowledgeRow).where(*superfluous))
 
 
 def mark_older(store: Store, older: Mapping[int, str]) -> None:

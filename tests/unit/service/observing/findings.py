@@ -8,7 +8,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from loopwright.service.results import Finding, FindingSource, GainsView, KnownGainsView, RangeView, TransferModelView
+from loopwright.service.results import (
+    FastResult,
+    Finding,
+    FindingSource,
+    GainsView,
+    KnownGainsView,
+    RangeView,
+    TransferModelView,
+)
+from loopwright.service.states.job_state import JobState
+from loopwright.service.store.jobs import Job
 from loopwright.tuning.gains import Gains
 
 T = 8.0
@@ -33,3 +43,15 @@ def finding(Ms: float | None = 1.30, uncertainty: float | None = 0.05, **changes
         "mv_range": RangeView(low=40.0, high=45.0),
     }  # fmt: skip
     return Finding(**fields | changes)
+
+
+def job(result: FastResult) -> Job:
+    """An accepted job."""
+    none = dict.fromkeys(
+        ("started_at", "ended_at", "stage", "stage_times_s", "reason", "detail", "old_gains", "restored", "found")
+    )
+    return Job(
+        number=1, id="j2", loop="A", state=JobState.ACCEPTED, dry_run=False, request={}, requested_by="me",
+        created_at="2026-02-01", plant_time_s=1.0, result=result, host="local", version="0", attempt=1, session=1,
+        look_after=False, stop_reason=None, **none,
+    )  # fmt: skip

@@ -9,11 +9,9 @@ import pytest
 
 from loopwright.service.observing.knowledge import Ms_of, adds_nothing, disagreeing, known, of_trial, replaced
 from loopwright.service.results import TYPED_IN, FastResult, Finding, FindingSource, GainsView
-from loopwright.service.states.job_state import JobState
-from loopwright.service.store.jobs import Job
 from loopwright.service.store.knowledge import Known
 from loopwright.tuning.gains import Gains
-from tests.unit.service.observing.findings import OTHER, PRESENT, PROPOSED, SIMC_MS, finding, gains, model
+from tests.unit.service.observing.findings import OTHER, PRESENT, PROPOSED, SIMC_MS, finding, gains, job, model
 
 TEST = {"source": FindingSource.JOB, "changes": None, "last_change_s": None, "job": "j1", "method": "fast"}
 
@@ -105,17 +103,6 @@ def test_a_look_at_less_of_the_history_does_not_displace_a_better_one() -> None:
     assert not adds_nothing(finding(1.50, 0.03), better), "another plant"
     assert not adds_nothing(finding(1.31, 0.03, **TEST), better)
     assert not adds_nothing(finding(1.31, 0.03), [Known(1, finding(1.30, 0.02), "older")])
-
-
-def job(result: FastResult) -> Job:
-    none = dict.fromkeys(
-        ("started_at", "ended_at", "stage", "stage_times_s", "reason", "detail", "old_gains", "restored", "found")
-    )
-    return Job(
-        number=1, id="j2", loop="A", state=JobState.ACCEPTED, dry_run=False, request={}, requested_by="me",
-        created_at="2026-02-01", plant_time_s=1.0, result=result, host="local", version="0", attempt=1, session=1,
-        look_after=False, stop_reason=None, **none,
-    )  # fmt: skip
 
 
 def test_an_accepted_trial_says_so_of_the_finding_whose_model_it_has() -> None:
