@@ -217,8 +217,6 @@ class Listening:
                 continue
             rows = joined(each)
             found = gaps(rows.bins, from_s, to_s)
-            if parts and found and found[0][0] == -math.inf:
-                found = ((parts[-1].bins["until_s"][-1].item(), found[0][1]), *found[1:])
             bins = between(rows.bins, from_s, np.nextafter(to_s, -math.inf))
             if len(bins):
                 shortest_s = shortest_gap_s(len(bins), from_s, to_s, points)

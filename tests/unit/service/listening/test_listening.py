@@ -87,6 +87,15 @@ def test_a_restart_is_a_gap_and_so_is_what_the_database_did_not_take(
     )
 
 
+def test_a_gap_between_blocks_that_are_read_apart_is_one(
+    listening: Listening, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(history, "_AT_ONCE", 1)
+    history.write(store, [block(0, first=True), block(2, first=True), block(6, first=True)])
+    gaps = listening.history(TAG, T0, T0 + 419.0, 5000).rows.gaps
+    assert gaps == ((pytest.approx(T0 + 59.9), T0 + 120.0), (pytest.approx(T0 + 179.9), T0 + 360.0))
+
+
 def test_a_damaged_block_is_a_gap(listening: Listening, store: Store, caplog: pytest.LogCaptureFixture) -> None:
     history.write(store, [block(0), replace(block(1), data=b"?"), block(2)])
     found = listening.history(TAG, T0, T0 + 179.0, 5000).rows
