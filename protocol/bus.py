@@ -233,11 +233,19 @@ class _Socketcand(SocketCanDaemonBus):
             raise
         server.settimeout(usual)
         if received != msg.encode():
+            server.close()
             raise can.CanError(f"expected {msg!r}, got {received!r}")
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        """Notices a server that is gone: the library would report a silent bus, without waiting for the time-out."""
-        received: tuple[can.Message | None, bool] = super()._recv_internal(timeout)  # type: ignore[no-untyped-call]
+        """Notices a server that is gone: the library would report a silent bus, without waiting for the time-out. The
+        library's own errors have a traceback in their text, which is left out."""
+        received: tuple[can.Message | None, bool]
+        try:
+            received = super()._recv_internal(timeout)  # type: ignore[no-untyped-call]
+        except can.CanError as error:
+            lost = isinstance(error.__cause__, OSError)
+            what = "the connection is lost" if lost else "the server has sent what is no frame"
+            raise can.CanError(f"{what}: {error.__cause__}") from error
         if received[0] is None and self._is_over():
             raise can.CanError("the server has closed the connection")
         return received
@@ -252,8 +260,9 @@ class _Socketcand(SocketCanDaemonBus):
             raise can.CanError(f"the connection is lost: {error}") from error
 
 
-# The library's client warns about every frame that TCP splits, although TCP may split any.
-logging.getLogger(SocketCanDaemonBus.__module__).setLevel(logging.ERROR)
+# The library's client warns about every frame that TCP splits, although TCP may split any, and logs a traceback of each
+# error that it raises.
+logging.getLogger(SocketCanDaemonBus.__module__).setLevel(logging.CRITICAL)
 
 _LIBRARY_STATES = {can.BusState.PASSIVE: BusState.PASSIVE, can.BusState.ERROR: BusState.BUS_OFF}
 

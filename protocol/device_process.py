@@ -13,9 +13,10 @@ from typing import Any, Protocol
 
 import yaml
 
-from loopwright.protocol.bus import Bus, BusError, open_bus
+from loopwright.protocol.bus import Bus, BusError
 from loopwright.protocol.device_runtime import Runtime
 from loopwright.protocol.profile import MAX_CHANNELS, node_name
+from loopwright.protocol.rejoined_bus import open_device_bus
 
 
 class DeviceConfigError(Exception):
@@ -82,7 +83,7 @@ def read_channels(path: str, keys: Iterable[str]) -> list[dict[str, Any]]:
 def run_device(name: str, bus_url: str, make: Callable[[Bus], DeviceProcess], description: str) -> int:
     """Runs a device until SIGTERM or SIGINT. Returns exit status 0, or 1 when the bus cannot be used."""
     try:
-        bus = open_bus(bus_url)
+        bus = open_device_bus(bus_url)
     except BusError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1

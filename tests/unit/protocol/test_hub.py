@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -161,3 +162,46 @@ def test_a_hub_that_is_gone_is_an_error_and_no_silent_bus() -> None:
             with pytest.raises(BusError, match="closed the connection"):
                 bus.recv(60.0)
         thread.join(60)
+
+
+_RESET_AT_CLOSE = struct.pack("ii", 1, 0)
+
+
+@pytest.mark.parametrize(
+    ("last", "said"),
+    [
+        (b"", "the connection is lost: .*reset by peer"),
+        (b"< frame zzz 1.0 00 >", "the server has sent what is no frame: .*'zzz'"),
+        (b"< error malformed frame >", "the server has sent what is no frame: .*'malformed'"),
+        (b"\xff\xff", "the server has sent what is no frame: .*0xff"),
+    ],
+)
+def test_what_is_wrong_with_a_server_is_said_in_one_line(
+    last: bytes, said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    opened = threading.Event()
+    with closing(socket.create_server(("127.0.0.1", 0))) as server:
+
+        def greet() -> None:
+            server.accept()[0].close()  # the probe
+            connection, _ = server.accept()
+            with connection:
+                for answer in (b"< hi >", b"< ok >"):
+                    connection.sendall(answer)
+                    connection.recv(64)
+                connection.sendall(b"< ok >")
+                assert opened.wait(60)
+                connection.sendall(last)
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_AT_CLOSE)
+                if last:
+                    connection.recv(64)  # until the client has gone
+
+        thread = threading.Thread(target=greet)
+        thread.start()
+        with closing(open_bus(f"socketcand:127.0.0.1:{server.getsockname()[1]}")) as bus:
+            opened.set()
+            with pytest.raises(BusError, match=said) as caught:
+                bus.recv(60.0)
+        thread.join(60)
+    assert "\n" not in str(caught.value)
+    assert not caplog.records
