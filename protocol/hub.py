@@ -11,9 +11,12 @@ frame.
 from __future__ import annotations
 
 import argparse
+import errno
+import re
 import selectors
 import signal
 import socket
+import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -25,6 +28,10 @@ _LONGEST_QUEUE = 32 << 20  # bytes waiting for one member; a member that hangs m
 _LONGEST_MESSAGE = 200
 # python-can's client expects "< ok >" alone in one read; frames within this time after it are delayed.
 _JOINING_S = 0.05
+_NO_ROOM = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+_ROOM_AGAIN_S = 1.0
+"""Time after which a hub that had no room for another connection looks again, s."""
+_SENT = re.compile(rb"send ([0-7][0-9a-f]{2}|[01][0-9a-f]{7}) ([0-8])((?: [0-9a-f]{1,2})*)", re.IGNORECASE)
 
 
 class _Member:
@@ -47,6 +54,10 @@ class Hub:
         self._wake, self._woken = socket.socketpair()
         self._selector = selectors.DefaultSelector()
         self._members: set[_Member] = set()
+        self._is_full = False
+        """Whether there was no room for the last one that wanted to join, which has been said."""
+        self._full_until: float | None = None
+        """Monotonic time until which nobody is let in then; None for any other time."""
 
     @property
     def url(self) -> str:
@@ -63,9 +74,7 @@ class Hub:
             self._selector.register(sock, selectors.EVENT_READ)
         try:
             while True:
-                now = time.monotonic()
-                waiting = any(m.queue and m.raw_from is not None and m.raw_from > now for m in self._members)
-                for key, events in self._selector.select(_JOINING_S if waiting else None):
+                for key, events in self._selector.select(self._longest_wait(time.monotonic())):
                     if key.fileobj is self._woken:
                         return
                     if key.fileobj is self._listener:
@@ -77,15 +86,43 @@ class Hub:
         finally:
             self._close()
 
+    def _longest_wait(self, now: float) -> float | None:
+        """Returns the time after which something is due that no connection announces, s; None for nothing."""
+        waits = []
+        if any(m.queue and m.raw_from is not None and m.raw_from > now for m in self._members):
+            waits.append(_JOINING_S)
+        if self._full_until is not None:
+            if now >= self._full_until:
+                self._full_until = None
+                self._selector.register(self._listener, selectors.EVENT_READ)
+            else:
+                waits.append(self._full_until - now)
+        return min(waits, default=None)
+
     def _welcome(self) -> None:
-        with suppress(OSError):
+        try:
             connection, _ = self._listener.accept()
+        except OSError as error:
+            if error.errno in _NO_ROOM:
+                self._let_wait(error)
+            return
+        self._is_full = False
+        with suppress(OSError):
             connection.setblocking(False)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             member = _Member(connection)
             self._members.add(member)
             self._selector.register(connection, selectors.EVENT_READ, member)
             connection.send(b"< hi >")
+
+    def _let_wait(self, error: OSError) -> None:
+        """Leaves whoever wants to join waiting for a while: the listener would be ready all the time."""
+        if not self._is_full:
+            more = f"end some of its {len(self._members)} members, or let it open more files (ulimit -n)"
+            print(f"hub: nobody else can join: {error.strerror}; {more}", file=sys.stderr, flush=True)
+        self._is_full = True
+        self._full_until = time.monotonic() + _ROOM_AGAIN_S
+        self._selector.unregister(self._listener)
 
     def _read(self, member: _Member) -> None:
         try:
@@ -169,14 +206,13 @@ class Hub:
 
 def _frame(words: list[bytes]) -> bytes | None:
     """Returns `send ID LENGTH BYTE...` as the other members receive it; None when it is not a CAN frame."""
-    try:
-        can_id, length, values = words[1], int(words[2], 16), [int(word, 16) for word in words[3:]]
-        if len(can_id) not in (3, 8) or length != len(values) or length > 8:
-            return None
-        int(can_id, 16)
-        return b"< frame %s %.6f %s >" % (can_id, time.time(), bytes(values).hex().encode())
-    except (ValueError, IndexError):
+    sent = _SENT.fullmatch(b" ".join(words))
+    if sent is None:
         return None
+    can_id, length, values = sent[1], int(sent[2]), bytes(int(word, 16) for word in sent[3].split())
+    if length != len(values):
+        return None
+    return b"< frame %s %.6f %s >" % (can_id, time.time(), values.hex().encode())
 
 
 def _port(text: str) -> int:

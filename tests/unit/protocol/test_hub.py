@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 import socket
 import struct
@@ -97,6 +98,68 @@ def test_rubbish_harms_nobody_else(hub: Hub, members: list[can.BusABC], rubbish:
         got = members[1].recv(60)
         assert got is not None
         assert got.data[0] == 5
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        b"FFF 1 1", b"800 1 1", b"-12 1 1", b"+12 1 1", b"1_2 1 1", b"20000000 1 1", b"-1234567 1 1", b"0x1 1 1",
+        b"12 1 1", b"190 1 -1", b"190 1 100", b"190 1 +1", b"190 1 0x1", b"190 1 1_1", b"190 +1 1", b"190 2 1",
+        b"190 0x1 1", b"190 9 0 0 0 0 0 0 0 0 0",
+    ],
+)  # fmt: skip
+def test_what_is_no_can_frame_is_refused_and_passed_on_to_nobody(hub: Hub, odd: bytes) -> None:
+    with closing(open_bus(hub.url)) as other, socket.create_connection(("127.0.0.1", hub.port), 60) as bad:
+        bad.sendall(b"< open vcan0 >< rawmode >< send " + odd + b" >< send 1aB 2 F 0a >")
+        assert other.recv(60.0) == (0x1AB, b"\x0f\x0a")
+        received = b""
+        while b"malformed" not in received:
+            part = bad.recv(200)
+            assert part
+            received += part
+
+
+class FullListener:
+    """Has no file descriptor left for `times` of those that want to join."""
+
+    def __init__(self, listener: socket.socket, times: int) -> None:
+        self.listener = listener
+        self.times = times
+        self.asked = 0
+
+    def accept(self) -> tuple[socket.socket, object]:
+        self.asked += 1
+        if self.asked <= self.times:
+            raise OSError(errno.EMFILE, "Too many open files")
+        return self.listener.accept()
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.listener, name)
+
+
+def test_a_hub_without_room_says_so_once_and_goes_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("loopwright.protocol.hub._ROOM_AGAIN_S", 0.2)
+    hub = Hub(port=0)
+    full = FullListener(vars(hub)["_listener"], 0)
+    monkeypatch.setattr(hub, "_listener", full)
+    thread = threading.Thread(target=hub.serve)
+    thread.start()
+    try:
+        with closing(open_bus(hub.url)) as first, closing(open_bus(hub.url)) as second:
+            full.asked, full.times = 0, 3
+            with closing(socket.create_connection(("127.0.0.1", hub.port), 60)) as third:
+                first.send(0x190, b"on")
+                assert second.recv(60.0) == (0x190, b"on")
+                assert third.recv(60) == b"< hi >"
+            assert full.asked == 4, "it does not ask all the time"
+    finally:
+        hub.stop()
+        thread.join(60)
+    errors = capsys.readouterr().err
+    assert errors.count("\n") == 1
+    assert "nobody else can join: Too many open files; end some of its" in errors
 
 
 def test_only_this_machine_can_reach_it(hub: Hub) -> None:
