@@ -13,6 +13,7 @@ import struct
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 
 from loopwright.containers import keeper
 
@@ -27,22 +28,35 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("argument", nargs="?", help="node: its number; service: where it is")
     options = parser.parse_args(argv)
     try:
+        node = _node(options.argument or "") if options.what == "node" else None
         if options.what == "service":
             answers(options.argument or SERVICE)
         else:
             url, connection = keeper.join(0.0)
             with connection:
-                if options.what == "node":
-                    hear(url, _HEARTBEAT + int(options.argument, 0))
+                if node is not None:
+                    hear(url, _HEARTBEAT + node)
     except (OSError, keeper.NoBus) as error:
         print(f"{options.what}: {error}")
         return 1
+    except ValueError as error:
+        parser.error(f"{options.what}: {error}")
     return 0
 
 
+def _node(text: str) -> int:
+    """Returns a node-ID. Raises ValueError."""
+    with suppress(ValueError):
+        if 1 <= (node := int(text, 0)) <= 127:
+            return node
+    raise ValueError(f"{text!r} is no node-ID: give one of 1 to 127, or as 0x20")
+
+
 def answers(url: str) -> None:
-    """Raises OSError when the service does not answer, or reports that it is not well."""
-    import urllib.error  # takes half of the time of the other checks
+    """Raises OSError when the service does not answer, or reports that it is not well, and ValueError for a URL that
+    is none."""
+    import http.client  # the three take half of the time of the other checks
+    import urllib.error
     import urllib.request
 
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
@@ -52,6 +66,10 @@ def answers(url: str) -> None:
         if error.code != 404:
             raise
         opener.open(f"{url}/loops", timeout=_WAIT_S).close()
+    except http.client.InvalidURL as error:
+        raise ValueError(str(error)) from error
+    except http.client.HTTPException as error:
+        raise ConnectionError(f"{url} answers, and not as a service does: {error!r}") from error
 
 
 def hear(bus: str, can_id: int) -> None:
@@ -86,9 +104,12 @@ def _on_hub(address: str, can_id: int) -> bool:
         while (left := give_up - time.monotonic()) > 0:
             hub.settimeout(left)
             try:
-                received += hub.recv(65536)
+                part = hub.recv(65536)
             except TimeoutError:
                 return False
+            if not part:
+                raise ConnectionError(f"the hub at {address} has ended")
+            received += part
             if wanted in received.lower():
                 return True
             received = received[-len(wanted) :]

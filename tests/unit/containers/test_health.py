@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.server
+import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -85,3 +86,59 @@ def test_no_service(capsys: pytest.CaptureFixture[str]) -> None:
         pass
     assert health.main(["service", url]) == 1
     assert "refused" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["node"], "node: '' is no node-ID: give one of 1 to 127"),
+        (["node", "plant"], "'plant' is no node-ID"),
+        (["node", "0"], "'0' is no node-ID"),
+        (["node", "0x80"], "'0x80' is no node-ID"),
+        (["service", "8080"], "unknown url type"),
+        (["service", "http://[::1"], "Invalid IPv6 URL"),
+        (["service", "http://127.0.0.1:80 80"], "nonnumeric port"),
+    ],
+)
+def test_a_wrong_argument_is_said_in_a_sentence(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        health.main(words)
+    assert caught.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("answer", [b"rubbish\r\n\r\n", b"HTTP/1.1 abc\r\n\r\n"])
+def test_what_answers_and_is_no_service(answer: bytes, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            connection, _ = server.accept()
+            with connection:
+                connection.recv(4096)
+                connection.sendall(answer)
+
+        serving = threading.Thread(target=serve)
+        serving.start()
+        assert health.main(["service", f"http://127.0.0.1:{server.getsockname()[1]}"]) == 1
+        serving.join()
+    assert "not as a service does" in capsys.readouterr().out
+
+
+def test_a_hub_that_ends_is_not_waited_for() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            connection, _ = server.accept()
+            with connection:
+                for answer in (b"< hi >", b"< ok >"):
+                    connection.sendall(answer)
+                    connection.recv(64)
+                connection.sendall(b"< ok >")
+
+        serving = threading.Thread(target=serve)
+        serving.start()
+        with pytest.raises(ConnectionError, match="has ended"):
+            health.hear(f"socketcand:127.0.0.1:{server.getsockname()[1]}", 0x720)
+        serving.join()

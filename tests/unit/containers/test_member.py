@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -14,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from loopwright.containers import keeper
-from loopwright.containers.member import BUS_GONE
+from loopwright.containers.member import BUS_GONE, NO_COMMAND
 
 URL = "socketcand:127.0.0.1:1"
 RUN = """
@@ -51,8 +52,10 @@ class Keeper:
             connection.sendall(f"{URL}\n".encode())
             self._connections.append(connection)
 
-    def let_go(self) -> None:
+    def let_go(self, broken: bool = False) -> None:
         for connection in self._connections:
+            if broken:
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             connection.close()
 
     def close(self) -> None:
@@ -133,3 +136,49 @@ def test_no_bus(bus: Keeper) -> None:
     assert process.returncode == 1 and errors.startswith("member: no bus")
     with pytest.raises(keeper.NoBus):
         keeper.join(0.0, ("127.0.0.1", bus.port))
+
+
+@pytest.mark.parametrize("word", ["TIC-101", "=TIC-101", ""])
+def test_a_setting_without_name_or_value_is_a_sentence(bus: Keeper, word: str) -> None:
+    process = start(bus.port, "--set", word, "--", "true")
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert f"{word!r} is not NAME=VALUE" in errors and "Traceback" not in errors
+
+
+def test_a_template_that_is_no_text_is_a_sentence(bus: Keeper, tmp_path: Path) -> None:
+    template = tmp_path / "template"
+    template.write_bytes(b"\xff")
+    process = start(bus.port, "--write", str(template), str(tmp_path / "file"), "--", "true")
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert errors.startswith(f"member: {template} is no text in UTF-8") and errors.count("\n") == 1
+
+
+def test_a_command_that_is_not_there_is_a_sentence(bus: Keeper) -> None:
+    process = start(bus.port, "--", "/no/such/command")
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == NO_COMMAND
+    assert errors == "member: '/no/such/command' cannot be started: No such file or directory\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_it_ends_quietly_when_asked_while_it_waits_for_the_bus(number: signal.Signals) -> None:
+    """It runs as the first process of its container, to which a signal without a handler is not delivered."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        process = start(silent.getsockname()[1], "--", "true")
+        connection, _ = silent.accept()
+        with connection:
+            process.send_signal(number)
+            output = process.communicate(timeout=120)
+    assert (process.returncode, output) == (128 + number, ("", ""))
+
+
+def test_a_bus_that_breaks_off_ends_the_command_too(bus: Keeper) -> None:
+    process = start(bus.port, "--", sys.executable, "-c", WAITS)
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("ready")
+    bus.let_go(broken=True)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == BUS_GONE
+    assert errors.startswith("made safe\nmember: the bus has ended")
