@@ -15,12 +15,11 @@ from dataclasses import dataclass, field
 
 from loopwright.protocol.bus import Bus, open_bus
 from loopwright.protocol.fair_lock import FairLock
+from loopwright.protocol.patience import WAIT_S
 from loopwright.protocol.profile import HEARTBEAT_FRAME, TUNER_NODE, NmtState, heartbeat_id, node_name
 
 HEARTBEAT_S = 0.1
 """Longest wall time between two heartbeats of this process, s."""
-WAIT_S = 0.05
-"""Longest single wait of a loop on the bus, s. A heartbeat that becomes due within the next wait is sent before it."""
 LISTEN_S = 2.0
 """Wall time for which a node listens for another one with its node-ID before its first heartbeat, s."""
 _LISTEN_STEP_S = 0.05

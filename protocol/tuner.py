@@ -14,6 +14,7 @@ from enum import StrEnum
 
 from loopwright.protocol.bus import Bus, Frame
 from loopwright.protocol.objects import Device, Object, Shape, Type, Value, lookup
+from loopwright.protocol.patience import Patience
 from loopwright.protocol.process_data import BusSample, ProcessData
 from loopwright.protocol.profile import (
     HEARTBEAT_FRAME,
@@ -29,9 +30,15 @@ from loopwright.protocol.profile import (
     sdo_response_id,
 )
 from loopwright.protocol.real32 import shortest
-from loopwright.protocol.station import WAIT_S, Station
+from loopwright.protocol.sdo import SdoAbort
+from loopwright.protocol.sdo_segments import SegmentedUpload
+from loopwright.protocol.station import Station
 
 _TAKE_IN_S = 0.1
+"""Time for which frames that are here already are received where nothing is asked for, s."""
+_BACKLOG_S = 30.0
+"""Time for which they are searched for an answer, or for all segments of one, s: a plant at full speed leaves thousands
+of them to a busy machine."""
 _ABORT = 0x80
 _URGENT = ("controller_session_renewal", "controller_order_close")
 RENEWAL_S = 0.5
@@ -165,10 +172,10 @@ class Tuner(ProcessData):
     def sample(self, timeout_s: float) -> BusSample | None:
         """Returns the next sample in order, or None when none came within `timeout_s` of wall time."""
         now = self.heartbeat()  # also while samples are queued: a tuner that catches up is alive
-        give_up = now + timeout_s
+        patience = Patience(now + timeout_s, _TAKE_IN_S)
         while not self._samples:
-            wait = WAIT_S if now < give_up else 0.0  # then only what is here already
-            if not self._receive(wait) and not wait:
+            wait = patience.wait(now)
+            if wait is None or (not self._receive(wait) and not wait):
                 return None
             now = self.heartbeat()
         return self._samples.popleft()
@@ -222,7 +229,7 @@ class Tuner(ProcessData):
                 length = 4 - (data[0] >> 2 & 3) if data[0] & 0x01 else entry.type.size
                 raw = data[4 : 4 + length]
             else:
-                raw = self._segments(entry, node)
+                raw = self._segments(entry, node, data)
         try:
             value = entry.type.decode(raw)
         except struct.error as error:
@@ -298,8 +305,8 @@ class Tuner(ProcessData):
                 self.station.sdo_retries[self._url] += 1
             attempt += 1
             self._bus.send(sdo_request_id(node), request)
-            give_up = self.station.monotonic() + self._sdo_timeout_s
-            while (answer := self._answer(node, give_up)) is not None:
+            patience = Patience(self.station.monotonic() + self._sdo_timeout_s, _BACKLOG_S)
+            while (answer := self._answer(node, patience)) is not None:
                 if answer[1:4] != address:
                     continue
                 if answer[0] == _ABORT:
@@ -308,32 +315,45 @@ class Tuner(ProcessData):
                     return answer
         raise TunerError(FailureKind.TIMEOUT, f"node {node_name(node)} does not answer ({entry.name})")
 
-    def _segments(self, entry: Object, node: int) -> bytes:
-        """Returns the rest of a value that is longer than one frame, such as a string."""
-        value, toggle = b"", 0
-        while True:
-            self._bus.send(sdo_request_id(node), bytes([0x60 | toggle, 0, 0, 0, 0, 0, 0, 0]))
-            answer = self._answer(node, self.station.monotonic() + self._sdo_timeout_s)
+    def _segments(self, entry: Object, node: int, begun: bytes) -> bytes:
+        """Returns a value that is longer than one frame, such as a string.
+
+        begun: the answer that began its upload.
+        """
+        give_up = self.station.monotonic() + _BACKLOG_S
+        try:
+            upload = SegmentedUpload(begun, entry.type.size)
+            while not upload.over:
+                self._bus.send(sdo_request_id(node), upload.request())
+                self._take_segment(entry, node, upload, give_up)
+        except SdoAbort as abort:
+            self._bus.send(sdo_request_id(node), bytes((_ABORT,)) + begun[1:4] + struct.pack("<I", abort.code))
+            why = ABORT_TEXT[abort.code]
+            text = f"{entry.name}: the segments of node {node_name(node)} do not make a value ({why})"
+            raise TunerError(FailureKind.ABORT, text, abort.code) from abort
+        return upload.value
+
+    def _take_segment(self, entry: Object, node: int, upload: SegmentedUpload, give_up: float) -> None:
+        """Raises SdoAbort for a segment that does not fit."""
+        patience = Patience(self.station.monotonic() + self._sdo_timeout_s, _BACKLOG_S)
+        taken = False
+        while not taken:
+            answer = self._answer(node, patience) if self.station.monotonic() < give_up else None
             if answer is None:
                 raise TunerError(FailureKind.TIMEOUT, f"node {node_name(node)} stopped in the middle of {entry.name}")
             if answer[0] == _ABORT:
                 raise _aborted(entry, answer)
-            if answer[0] & 0xF0 != toggle:
-                raise TunerError(FailureKind.ABORT, f"{entry.name}: segments out of order", Abort.TOGGLE)
-            value += answer[1 : 8 - (answer[0] >> 1 & 7)]
-            if answer[0] & 0x01:
-                return value
-            toggle ^= 0x10
+            taken = upload.take(answer)
 
-    def _answer(self, node: int, give_up: float) -> bytes | None:
+    def _answer(self, node: int, patience: Patience) -> bytes | None:
         wanted = sdo_response_id(node)
         while True:
             while self._answers:
                 can_id, data = self._answers.popleft()
                 if can_id == wanted and len(data) == 8:
                     return data
-            wait = WAIT_S if self.heartbeat() < give_up else 0.0  # then only what is here already
-            if not self._receive(wait) and not wait:
+            wait = patience.wait(self.heartbeat())
+            if wait is None or (not self._receive(wait) and not wait):
                 return None
 
 

@@ -11,9 +11,9 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 
+from loopwright.protocol.patience import WAIT_S
 from loopwright.protocol.process_data import BusSample
 from loopwright.protocol.profile import FOREVER, node_name, samples_between
-from loopwright.protocol.station import WAIT_S
 from loopwright.protocol.tuner import Tuner
 from loopwright.service.loops.bus_connection import BusConnection
 from loopwright.service.loops.bus_session import BusSession

@@ -7,8 +7,9 @@ from itertools import pairwise
 import pytest
 
 from loopwright.protocol.bus import Frame
+from loopwright.protocol.patience import WAIT_S
 from loopwright.protocol.profile import HEARTBEAT_FRAME, TUNER_NODE, NmtState, heartbeat_id
-from loopwright.protocol.station import HEARTBEAT_S, LISTEN_S, WAIT_S, NodeTaken, Station
+from loopwright.protocol.station import HEARTBEAT_S, LISTEN_S, NodeTaken, Station
 from tests.unit.protocol.memory_bus import MemoryBus, Wire
 
 BEAT = HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL)

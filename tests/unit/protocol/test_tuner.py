@@ -11,6 +11,7 @@ import pytest
 from loopwright.protocol.bus import Bus
 from loopwright.protocol.object_dictionary import Dictionary
 from loopwright.protocol.objects import Device
+from loopwright.protocol.patience import WAIT_S
 from loopwright.protocol.profile import (
     MV_FRAME,
     PV_FRAME,
@@ -26,7 +27,7 @@ from loopwright.protocol.profile import (
     sdo_response_id,
 )
 from loopwright.protocol.sdo import SdoServer
-from loopwright.protocol.station import HEARTBEAT_S, WAIT_S, Station
+from loopwright.protocol.station import HEARTBEAT_S, Station
 from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
 
 NODE, PLANT = 0x20, 0x10
@@ -274,6 +275,49 @@ def test_a_bus_that_brings_more_than_can_be_taken_silences_nobody() -> None:
     assert tuner.number("controller_mode") == 2
     assert time.monotonic() - began < 0.5
     assert (heartbeat_id(TUNER_NODE), b"\x05") in bus.sent
+
+
+def test_a_node_that_babbles_keeps_nobody_from_a_time_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("loopwright.protocol.tuner._BACKLOG_S", 0.1)
+    bus = Flood()
+    tuner = tuner_on(bus)
+    began = time.monotonic()
+    assert tuner.sample(0.01) is None
+    bus.mute = 100
+    with pytest.raises(TunerError, match="does not answer"):
+        tuner.number("controller_mode")
+    assert time.monotonic() - began < 5.0
+
+
+class Foreign(Flood):
+    """Answers what nobody has asked for, without end."""
+
+    def recv(self, timeout: float | None) -> tuple[int, bytes] | None:
+        super().recv(timeout)
+        return sdo_response_id(NODE), bytes([0x4F, 0x00, 0x10, 0, 3, 0, 0, 0])
+
+
+def test_answers_that_nobody_has_asked_for_keep_nobody_from_a_time_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("loopwright.protocol.tuner._BACKLOG_S", 0.1)
+    bus = Foreign()
+    bus.mute = 100
+    with pytest.raises(TunerError, match="does not answer"):
+        tuner_on(bus).number("controller_mode")
+
+
+def test_who_has_stood_still_still_gets_the_sample_that_came_meanwhile(bus: ListBus) -> None:
+    now = [100.0]
+    tuner = tuner_on(bus, station=Station(listen_s=0.0, monotonic=lambda: now[0], open_bus=lambda url: bus))
+
+    def stand_still(timeout: float | None) -> tuple[int, bytes] | None:
+        del bus.recv  # type: ignore[method-assign]
+        now[0] += 60.0
+        return None
+
+    bus.recv = stand_still  # type: ignore[method-assign]
+    bus.incoming.extend(sample(9))
+    found = tuner.sample(1.0)
+    assert found is not None and found.n == 9
 
 
 def test_who_takes_samples_that_wait_beats_meanwhile(bus: ListBus, tuner: Tuner) -> None:
