@@ -197,14 +197,16 @@ class PlantDevice:
         missing = sorted(self._unanswered)
         self._unanswered.clear()
         self._missing_in_all += 1
-        self.runtime.raise_error(Emcy.NO_ANSWER, bytes((missing[0] + 1,)))
         reaction = int(self.dictionary.get("plant_on_missing_answer"))
         if reaction == OnMissingAnswer.STOP_RUN:
             self._remaining = 0
         elif reaction == OnMissingAnswer.SAFE_OUTPUT:
             for at in missing:
                 self.mv[at] = float(self.dictionary.get("plant_safe_output", at + 1))
-        self._advance()
+        try:
+            self.runtime.raise_error(Emcy.NO_ANSWER, bytes((missing[0] + 1,)))
+        finally:  # reaction and time do not depend on a bus that takes the frame
+            self._advance()
 
     # The object dictionary
 

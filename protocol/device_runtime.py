@@ -110,9 +110,11 @@ class Runtime:
         for sub in (1, 2):
             self._watches.watch(sub, int(self.dictionary.get("heartbeat_consumer", sub)))
         self._collect_handlers()
-        self._bus.send(heartbeat_id(self.node), HEARTBEAT_FRAME.pack(NmtState.BOOT_UP))
-        self._enter(NmtState.PRE_OPERATIONAL)
-        self._enter(NmtState.OPERATIONAL)
+        try:
+            self._bus.send(heartbeat_id(self.node), HEARTBEAT_FRAME.pack(NmtState.BOOT_UP))
+        finally:  # after a reset the device controls again also where the bus does not take that frame
+            self._enter(NmtState.PRE_OPERATIONAL)
+            self._enter(NmtState.OPERATIONAL)
 
     def stop(self) -> None:
         """Ends `run`; it may be called from a signal handler."""
@@ -171,9 +173,13 @@ class Runtime:
         between = self._between_ticks // 2 if slow else self._between_ticks * 2
         self._countdown = self._between_ticks = min(max(between, 1), _MAX_FRAMES_BETWEEN_TICKS)
         self._last_tick = now
-        self._produce_heartbeat(now)
-        self._consume_heartbeats(now)
-        self.on_tick(now)
+        try:
+            self._produce_heartbeat(now)
+        finally:  # the device's own time goes on also where the bus takes no frame
+            try:
+                self._consume_heartbeats(now)
+            finally:
+                self.on_tick(now)
 
     # NMT
 
@@ -226,7 +232,8 @@ class Runtime:
 
         The writers of changed objects are called as by an SDO, in the state in which these objects may be written.
         """
-        self._enter(NmtState.PRE_OPERATIONAL)
+        with contextlib.suppress(BusError):  # the bus may not take a last PDO; the reset goes on
+            self._enter(NmtState.PRE_OPERATIONAL)
         self.sdo.end()
         self._emergencies.forget()
         self._too_short.clear()

@@ -7,8 +7,18 @@ from contextlib import suppress
 import pytest
 
 from loopwright.protocol.bus import BusError
-from loopwright.protocol.profile import NMT_FRAME, NMT_ID, STATUS_FRAME, Cause, Mode, NmtCommand, NmtState, channel_ids
-from tests.unit.protocol.rig import CONTROLLER, Rig
+from loopwright.protocol.profile import (
+    FOREVER,
+    NMT_FRAME,
+    NMT_ID,
+    STATUS_FRAME,
+    Cause,
+    Mode,
+    NmtCommand,
+    NmtState,
+    channel_ids,
+)
+from tests.unit.protocol.rig import CONTROLLER, KP, Rig
 
 
 @pytest.mark.parametrize("sub", [1, 2])
@@ -51,3 +61,79 @@ def test_a_stop_ends_every_test_where_the_bus_takes_no_frame(monkeypatch: pytest
             rig.pump()
     assert [session.cause for session in rig.controller.sessions] == [Cause.NMT, Cause.NMT]
     assert rig.controller.runtime.state is NmtState.STOPPED
+
+
+def refused(can_id: int, data: bytes) -> None:
+    raise BusError("the interface is down")
+
+
+@pytest.mark.parametrize("period_ms", [10, 20, 100])
+def test_a_controller_goes_home_without_a_bus_however_often_it_beats(
+    period_ms: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Rig()
+    assert rig.write("heartbeat_producer", period_ms) is None
+    rig.run(1)
+    rig.open()
+    with monkeypatch.context() as away:
+        away.setattr(vars(rig.controller.runtime)["_bus"], "send", refused)
+        for _ in range(100):
+            rig.wire.clock.now += 0.05
+            with suppress(BusError):
+                rig.controller.runtime.tick()
+        assert not rig.controller.sessions[0].is_open
+
+
+def test_a_node_that_is_lost_while_the_bus_is_away_does_not_keep_the_device_from_its_work(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = Rig()
+    ticked: list[float] = []
+    rig.controller.runtime.on_tick = ticked.append
+    monkeypatch.setattr(rig.controller.runtime, "raise_error", refused)
+    rig.write("heartbeat_consumer", 0x00100064, 1)
+    rig.client.send(0x710, b"\x05")
+    rig.pump()
+    rig.wire.clock.now += 1.0
+    ticked.clear()
+    with suppress(BusError):
+        rig.controller.runtime.tick()
+    assert ticked
+
+
+def test_an_io_without_a_bus_takes_its_safe_output_after_one_answer_time_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig(pace=1.0)
+    assert rig.write("plant_on_missing_answer", 2) is None
+    assert rig.write("plant_safe_output", 12.5) is None
+    assert rig.write("plant_samples_to_run", FOREVER) is None
+    rig.wait(1.0)
+    assert rig.plant.mv != [12.5]
+    with monkeypatch.context() as away:
+        away.setattr(rig.plant, "_send", refused)
+        away.setattr(vars(rig.plant.runtime)["_bus"], "send", refused)
+        began = rig.wire.clock.now
+        while rig.plant.mv != [12.5] and rig.wire.clock.now < began + 5.0:
+            rig.wire.clock.now += 0.02
+            with suppress(BusError):
+                rig.plant.runtime.poll(0.0)
+            with suppress(BusError):
+                rig.plant.runtime.tick()
+    assert rig.wire.clock.now - began < 0.1 + 0.1 + 0.05
+
+
+def test_a_reset_ends_operational_also_where_the_bus_takes_no_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig()
+    rig.run(1)
+    rig.open()
+    rig.write("controller_staged_kp", 300.0)
+    with monkeypatch.context() as full:
+        full.setattr(rig.controller, "_send", refused)
+        full.setattr(vars(rig.controller.runtime)["_bus"], "send", refused)
+        rig.client.send(NMT_ID, NMT_FRAME.pack(NmtCommand.RESET_NODE, CONTROLLER))
+        with suppress(BusError):
+            rig.pump()
+    assert rig.controller.runtime.state is NmtState.OPERATIONAL
+    assert rig.read("controller_staged_kp") == KP
+    before = len(rig.wire.sent(channel_ids(1).mv))
+    rig.run(1)
+    assert len(rig.wire.sent(channel_ids(1).mv)) == before + 1
