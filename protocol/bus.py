@@ -36,6 +36,7 @@ _SEND_PATIENCE_S = 1.0
 SO_RCVBUFFORCE = 33
 _CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h
 _ARPHRD_CAN = "280"  # linux/if_arp.h
+_AWAY = (errno.ENODEV, errno.ENXIO)
 _PASSED_OVER_S = 0.05  # how long filtered-out frames may prolong a wait beyond its time-out
 
 
@@ -83,18 +84,25 @@ def open_bus(url: str) -> Bus:
 
 
 class RawBus:
-    """A bus on Linux SocketCAN, without a library in between."""
+    """A bus on Linux SocketCAN, without a library in between. An interface that was down is found again by its socket,
+    one that was away, such as an adapter that was unplugged, by a new socket."""
 
     def __init__(self, interface: str) -> None:
-        self._socket = _opened(interface)
-        self.state = BusState.ACTIVE
         self._interface = interface
+        self._wanted: Collection[int] | None = None
+        self._use(_opened(interface))
+
+    def _use(self, sock: socket.socket) -> None:
+        self._socket = sock
+        self.state = BusState.ACTIVE
         self._armed: float | None = None
         self._poll = select.poll()
-        self._poll.register(self._socket, select.POLLIN)
+        self._poll.register(sock, select.POLLIN)
         # The bound methods are stored: otherwise they would be looked up twice per frame.
-        self._recv = self._socket.recv
-        self._send: Callable[[bytes], int] = self._socket.send
+        self._recv: Callable[..., bytes] = sock.recv
+        self._send: Callable[[bytes], int] = sock.send
+        if self._wanted is not None:
+            self.set_filters(self._wanted)
 
     def send(self, can_id: int, data: bytes) -> None:
         frame = _CAN_FRAME.pack(can_id, len(data), data)
@@ -114,6 +122,7 @@ class RawBus:
                 return
             except OSError as again:
                 error = again
+        self._note(error)
         raise BusError(f"cannot send on {self._interface!r}: {error.strerror}") from error
 
     def recv(self, timeout: float | None) -> Frame | None:
@@ -130,8 +139,7 @@ class RawBus:
         except BlockingIOError:
             return self._nothing()
         except OSError as error:
-            if error.errno == errno.ENETDOWN:
-                self._become(BusState.ACTIVE)  # its state when it comes up again, which no frame reports
+            self._note(error)
             raise BusError(f"cannot receive on {self._interface!r}: {error.strerror}") from error
         can_id, length, data = _CAN_FRAME.unpack(raw)
         if can_id & _NOT_DATA:
@@ -144,6 +152,29 @@ class RawBus:
         if self.state is BusState.BUS_OFF:
             raise BusError(bus_off_advice(self._interface))
         return None
+
+    def _note(self, error: OSError) -> None:
+        """Notes an interface that is down or away. The socket of one that is away never finds it again: it receives
+        nothing, without an error."""
+        if error.errno == errno.ENETDOWN:
+            self._become(BusState.ACTIVE)  # its state when it comes up again, which no frame reports
+        elif error.errno in _AWAY:
+            self.state = BusState.ACTIVE
+            self._recv, self._send = self._recv_again, self._send_again
+
+    def _recv_again(self, *arguments: int) -> bytes:
+        self._open_again()
+        raise BlockingIOError  # the new socket has no time-out yet
+
+    def _send_again(self, frame: bytes) -> int:
+        self._open_again()
+        return self._send(frame)
+
+    def _open_again(self) -> None:
+        """Takes a new socket. Raises BusError while the interface is away."""
+        sock = _opened(self._interface)
+        self._socket.close()
+        self._use(sock)
 
     def _become(self, state: BusState) -> None:
         """Notes the state. The kernel accepts frames for an interface that is bus-off and drops them silently, so
@@ -163,6 +194,7 @@ class RawBus:
         self._armed = timeout
 
     def set_filters(self, ids: Collection[int]) -> None:
+        self._wanted = frozenset(ids)
         mask = socket.CAN_SFF_MASK | socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG
         filters = b"".join(struct.pack("=II", can_id, mask) for can_id in sorted(ids))
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)

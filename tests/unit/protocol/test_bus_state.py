@@ -12,7 +12,7 @@ import can
 import pytest
 
 from loopwright.protocol import bus as bus_module
-from loopwright.protocol.bus import BusError, LibraryBus, RawBus
+from loopwright.protocol.bus import BusError, Frame, LibraryBus, RawBus
 from loopwright.protocol.bus_state import BusState, state_after
 
 ACTIVE, WARNING, PASSIVE, BUS_OFF = BusState
@@ -108,6 +108,45 @@ class TestRawBus:
         with pytest.raises(BusError, match="down"):
             raw.bus.recv(0.0)
         assert raw.bus.state is ACTIVE
+
+    @pytest.mark.parametrize("first", ["send", "recv"])
+    def test_an_interface_that_was_away_is_opened_again(
+        self, raw: Raw, monkeypatch: pytest.MonkeyPatch, first: str
+    ) -> None:
+        filters: list[set[int]] = []
+        monkeypatch.setattr(RawBus, "set_filters", lambda bus, ids: filters.append(set(ids)))
+        monkeypatch.setattr(raw.bus, "_wanted", frozenset({0x190}))
+
+        def away(*arguments: object) -> int:
+            raise OSError(errno.ENXIO, os.strerror(errno.ENXIO))
+
+        def not_there(interface: str) -> socket.socket:
+            raise BusError(f"this machine has no CAN interface {interface!r}")
+
+        def use(what: str) -> Frame | None:
+            if what == "recv":
+                return raw.bus.recv(0.0)
+            raw.bus.send(0x2A0, b"\3")
+            return None
+
+        for name in ("_recv", "_send"):
+            monkeypatch.setattr(raw.bus, name, away)
+        monkeypatch.setattr(bus_module, "_opened", not_there)
+        with pytest.raises(BusError, match="No such device or address"):
+            use(first)
+        for what in ("recv", "send", "recv"):
+            with pytest.raises(BusError, match="has no CAN interface 'can0'"):
+                use(what)
+        ours, plugged = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with plugged:
+            monkeypatch.setattr(bus_module, "_opened", lambda interface: ours)
+            assert use(first) is None
+            assert filters == [{0x190}]
+            plugged.send(FRAME.pack(0x190, 1, b"\5"))
+            assert raw.bus.recv(0.02) == (0x190, b"\5")
+            raw.bus.send(0x2A1, b"\4")
+            sent = [plugged.recv(16)[:2] for _ in range(2 if first == "send" else 1)]
+            assert sent[-1] == b"\xa1\x02"
 
 
 class Adapter:
