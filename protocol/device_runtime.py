@@ -175,6 +175,7 @@ class Runtime:
         self._last_tick = now
         try:
             self._produce_heartbeat(now)
+            self._emergencies.send_unsent()
         finally:  # the device's own time goes on also where the bus takes no frame
             try:
                 self._consume_heartbeats(now)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 
 from loopwright.protocol.object_dictionary import Dictionary
@@ -10,6 +11,7 @@ from loopwright.protocol.profile import EMCY_FRAME, EMCY_REGISTER, Abort, Emcy
 from loopwright.protocol.sdo import SdoAbort
 
 _MAX_REMEMBERED = len(lookup("error_field").names)
+_MAX_UNSENT = 32
 
 
 class Emergencies:
@@ -22,6 +24,8 @@ class Emergencies:
         self._send = send
         self._errors: list[tuple[Emcy, bytes]] = []
         self._history: list[int] = []
+        self._unsent: deque[bytes] = deque(maxlen=_MAX_UNSENT)
+        """The EMCY frames that the bus has not taken yet."""
         dictionary.on_read["error_register"] = lambda sub: self._register()
         dictionary.on_read["error_field"] = self._read_history
         dictionary.on_write["error_field"] = self._write_history
@@ -38,7 +42,7 @@ class Emergencies:
             return
         self._errors.append(error)
         self._history = [int(code), *self._history][:_MAX_REMEMBERED]
-        self._send(EMCY_FRAME.pack(code, EMCY_REGISTER[code], detail[:5]))
+        self._tell(EMCY_FRAME.pack(code, EMCY_REGISTER[code], detail[:5]))
 
     def clear_error(self, code: Emcy, source: bytes | None = None) -> None:
         """Ends the error of one source, or of all, and reports it by EMCY 0000h with the register of the remaining
@@ -46,7 +50,17 @@ class Emergencies:
         left = [error for error in self._errors if error[0] != code or source not in (None, error[1])]
         if len(left) < len(self._errors):
             self._errors = left
-            self._send(EMCY_FRAME.pack(Emcy.ERROR_GONE, self._register(), b""))
+            self._tell(EMCY_FRAME.pack(Emcy.ERROR_GONE, self._register(), b""))
+
+    def _tell(self, frame: bytes) -> None:
+        self._unsent.append(frame)
+        self.send_unsent()
+
+    def send_unsent(self) -> None:
+        """Sends the EMCY frames that the bus has not taken before. Raises BusError when it does not take one now."""
+        while self._unsent:
+            self._send(self._unsent[0])
+            self._unsent.popleft()
 
     def sources(self, code: Emcy) -> list[bytes]:
         """Returns the sources of the errors with this code that are not cleared."""
@@ -56,6 +70,7 @@ class Emergencies:
         """Drops all errors as at power-on, without sending an EMCY."""
         self._errors.clear()
         self._history.clear()
+        self._unsent.clear()
 
     def _register(self) -> int:
         register = 0

@@ -13,6 +13,7 @@ from loopwright.protocol.profile import (
     NMT_ID,
     STATUS_FRAME,
     Cause,
+    Emcy,
     Mode,
     NmtCommand,
     NmtState,
@@ -137,3 +138,34 @@ def test_a_reset_ends_operational_also_where_the_bus_takes_no_frame(monkeypatch:
     before = len(rig.wire.sent(channel_ids(1).mv))
     rig.run(1)
     assert len(rig.wire.sent(channel_ids(1).mv)) == before + 1
+
+
+def test_the_errors_that_the_bus_did_not_take_are_told_in_order_when_it_is_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = Rig()
+    rig.run(1)
+    rig.open()
+    with monkeypatch.context() as away:
+        away.setattr(rig.controller, "_send", refused)
+        away.setattr(vars(rig.controller.runtime)["_bus"], "send", refused)
+        for _ in range(200):
+            rig.wire.clock.now += 0.02
+            with suppress(BusError):
+                rig.controller.runtime.tick()
+    assert rig.emergencies(CONTROLLER) == []
+    rig.wait(0.1)
+    assert rig.emergencies(CONTROLLER) == [Emcy.TUNER_LOST, Emcy.NO_PV]
+    rig.wait(1.0)
+    assert rig.emergencies(CONTROLLER) == [Emcy.TUNER_LOST, Emcy.NO_PV], "once"
+
+
+def test_errors_are_not_told_by_a_node_that_has_been_reset_since(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig()
+    with monkeypatch.context() as away:
+        away.setattr(vars(rig.controller.runtime)["_bus"], "send", refused)
+        with suppress(BusError):
+            rig.controller.runtime.raise_error(Emcy.TUNER_LOST, b"\1")
+    rig.nmt(NmtCommand.RESET_NODE, CONTROLLER)
+    rig.wait(0.1)
+    assert Emcy.TUNER_LOST not in rig.emergencies(CONTROLLER)
