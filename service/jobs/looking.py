@@ -84,6 +84,7 @@ class Looking:
         self._every_s, self._wall = every_s, wall
         self._spec = DesignSpec()
         self._loops = {tag: _Loop() for tag in directory.loops}
+        self._latest_s = -math.inf
         failed = "the histories of the loops could not be looked at"
         self._looks = Repeated(self.look_at_due_loops, _ROUND_S, "looks at histories", failed, at_once=False)
 
@@ -96,6 +97,9 @@ class Looking:
     def look_at_due_loops(self) -> list[str]:
         """Looks at every loop whose time has come and whose set-point was changed. Returns their tags. Raises
         SQLAlchemyError, FolderInUse."""
+        if self._wall() < self._latest_s:  # the clock was put back, and with it the history
+            self._loops = {tag: _Loop() for tag in self._loops}
+        self._latest_s = self._wall()
         looked = []
         for config in self._directory.loops.values():
             if self._stopping():

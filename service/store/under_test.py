@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -18,8 +19,10 @@ _ACTIVE = [state.value for state in ACTIVE]
 
 @dataclass(frozen=True, slots=True)
 class TimeUnderTest:
-    """A time in which a job had a loop, seconds since 1970 UTC. to_s: None where it still has it.
+    """A time in which a job had a loop, seconds since 1970 UTC.
 
+    from_s: minus infinity where the clock was put back meanwhile: what the begin is on the present time is not known.
+    to_s: None where the job still has the loop.
     session: whether it has opened a session, before which it moves nothing.
     """
 
@@ -50,12 +53,17 @@ def times_under_test(store: Store, loops: Collection[str], since: datetime | Non
         TimeUnderTest(
             row.loop,
             row.id,
-            _seconds(row.started_at or row.created_at),
-            None if row.ended_at is None else _seconds(row.ended_at),
+            *_begin_and_end(row.started_at or row.created_at, row.ended_at),
             row.session is not None,
         )
         for row in rows
     ]
+
+
+def _begin_and_end(began_at: str, ended_at: str | None) -> tuple[float, float | None]:
+    if ended_at is None:
+        return _seconds(began_at), None
+    return _seconds(began_at) if began_at <= ended_at else -math.inf, _seconds(ended_at)
 
 
 def _seconds(at: str) -> float:

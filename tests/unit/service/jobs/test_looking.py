@@ -95,6 +95,14 @@ def test_a_change_is_looked_at_when_it_has_been_followed(service: Service) -> No
     assert here.found() == [], "one change alone is no answer"
 
 
+def test_a_clock_that_was_put_back_does_not_end_the_looks(service: Service) -> None:
+    here = Looked(service, dict(MOVES))
+    assert here.looking.look_at_due_loops() == [TAG]
+    here.now_s -= 86_400.0
+    here.goes_on(2.0 * LOOK_EVERY_S, {4000: 0.5, 4900: -0.7})
+    assert here.looking.look_at_due_loops() == [TAG]
+
+
 @pytest.mark.parametrize("sample_time_s, looks", [(0.1, False), (0.02, True)])
 def test_the_next_look_comes_before_the_samples_are_gone(
     service: Service, monkeypatch: pytest.MonkeyPatch, sample_time_s: float, looks: bool

@@ -44,3 +44,13 @@ def test_the_times_of_the_tests_of_some_loops(store: Store) -> None:
     assert [each.job_id for each in times_under_test(store, ("A", "B"))] == [waiting, running]
     assert len(times_under_test(store, ("A",), NOW - timedelta(hours=9.0))) == 3 and old
     assert times_under_test(store, ()) == []
+
+
+def test_a_test_in_which_the_clock_was_put_back_may_have_begun_at_any_time_before_its_end(store: Store) -> None:
+    """It ended, says the clock, before it began; when it began on the present time is not known."""
+    ended = job(store, "A", 8.0)
+    (found,) = times_under_test(store, ("A",), NOW - timedelta(hours=9.0))
+    now_s = NOW.timestamp()
+    within = found.within(now_s - 36000.0, now_s)
+    assert found.job_id == ended and within is not None
+    assert [round((at - now_s) / 3600.0, 2) for at in within] == [-10.0, -8.0]
