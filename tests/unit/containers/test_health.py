@@ -14,6 +14,7 @@ from loopwright.containers import health
 from loopwright.protocol.bus import open_bus
 from loopwright.protocol.hub import Hub
 from loopwright.protocol.profile import heartbeat_id
+from tests.unit.protocol.socketcand_server import greet
 
 
 @pytest.fixture
@@ -132,10 +133,7 @@ def test_a_hub_that_ends_is_not_waited_for() -> None:
         def serve() -> None:
             connection, _ = server.accept()
             with connection:
-                for answer in (b"< hi >", b"< ok >"):
-                    connection.sendall(answer)
-                    connection.recv(64)
-                connection.sendall(b"< ok >")
+                greet(connection)
 
         serving = threading.Thread(target=serve)
         serving.start()

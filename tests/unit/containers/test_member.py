@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
@@ -16,6 +15,7 @@ import pytest
 
 from loopwright.containers import keeper
 from loopwright.containers.member import BUS_GONE, NO_COMMAND
+from tests.unit.protocol.socketcand_server import reset_at_close
 
 URL = "socketcand:127.0.0.1:1"
 RUN = """
@@ -55,7 +55,7 @@ class Keeper:
     def let_go(self, broken: bool = False) -> None:
         for connection in self._connections:
             if broken:
-                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                reset_at_close(connection)
             connection.close()
 
     def close(self) -> None:

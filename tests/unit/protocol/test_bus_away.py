@@ -140,7 +140,7 @@ def test_a_reset_ends_operational_also_where_the_bus_takes_no_frame(monkeypatch:
     assert len(rig.wire.sent(channel_ids(1).mv)) == before + 1
 
 
-def test_the_errors_that_the_bus_did_not_take_are_told_in_order_when_it_is_back(
+def test_the_errors_that_the_bus_did_not_take_are_sent_in_order_when_it_is_back(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rig = Rig()
@@ -160,7 +160,7 @@ def test_the_errors_that_the_bus_did_not_take_are_told_in_order_when_it_is_back(
     assert rig.emergencies(CONTROLLER) == [Emcy.TUNER_LOST, Emcy.NO_PV], "once"
 
 
-def test_errors_are_not_told_by_a_node_that_has_been_reset_since(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_are_not_sent_by_a_node_that_has_been_reset_since(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = Rig()
     with monkeypatch.context() as away:
         away.setattr(vars(rig.controller.runtime)["_bus"], "send", refused)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
@@ -17,6 +16,7 @@ import pytest
 
 from loopwright.protocol.bus import BusError, open_bus
 from loopwright.protocol.hub import Hub
+from tests.unit.protocol.socketcand_server import greet, reset_at_close
 
 
 @pytest.fixture
@@ -209,25 +209,19 @@ def test_a_server_that_says_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch)
 def test_a_hub_that_is_gone_is_an_error_and_no_silent_bus() -> None:
     with closing(socket.create_server(("127.0.0.1", 0))) as server:
 
-        def greet() -> None:
+        def serve() -> None:
             server.accept()[0].close()  # the probe
             connection, _ = server.accept()
             with connection:
-                for answer in (b"< hi >", b"< ok >"):
-                    connection.sendall(answer)
-                    connection.recv(64)
-                connection.sendall(b"< ok >")
+                greet(connection)
 
-        thread = threading.Thread(target=greet)
+        thread = threading.Thread(target=serve)
         thread.start()
         with closing(open_bus(f"socketcand:127.0.0.1:{server.getsockname()[1]}")) as bus:
             bus.set_filters({1})
             with pytest.raises(BusError, match="closed the connection"):
                 bus.recv(60.0)
         thread.join(60)
-
-
-_RESET_AT_CLOSE = struct.pack("ii", 1, 0)
 
 
 @pytest.mark.parametrize(
@@ -245,21 +239,18 @@ def test_what_is_wrong_with_a_server_is_said_in_one_line(
     opened = threading.Event()
     with closing(socket.create_server(("127.0.0.1", 0))) as server:
 
-        def greet() -> None:
+        def serve() -> None:
             server.accept()[0].close()  # the probe
             connection, _ = server.accept()
             with connection:
-                for answer in (b"< hi >", b"< ok >"):
-                    connection.sendall(answer)
-                    connection.recv(64)
-                connection.sendall(b"< ok >")
+                greet(connection)
                 assert opened.wait(60)
                 connection.sendall(last)
-                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_AT_CLOSE)
+                reset_at_close(connection)
                 if last:
                     connection.recv(64)  # until the client has gone
 
-        thread = threading.Thread(target=greet)
+        thread = threading.Thread(target=serve)
         thread.start()
         with closing(open_bus(f"socketcand:127.0.0.1:{server.getsockname()[1]}")) as bus:
             opened.set()

@@ -9,6 +9,7 @@ from itertools import cycle
 import pytest
 
 from loopwright.protocol.bus import Frame
+from loopwright.protocol.bus_state import BusState
 from loopwright.protocol.objects import lookup
 from loopwright.protocol.profile import Abort, sdo_request_id, sdo_response_id
 from loopwright.protocol.sdo_segments import LONGEST
@@ -32,6 +33,8 @@ def aborted(code: int, address: bytes = NAME) -> bytes:
 
 class Device:
     """Answers each request with the next of these frames; a request that it has none for is not answered."""
+
+    state = BusState.ACTIVE
 
     def __init__(self, clock: Clock, frames: Iterator[bytes | tuple[bytes, ...]]) -> None:
         self.clock = clock
@@ -74,7 +77,7 @@ def reading(clock: Clock, *frames: bytes | tuple[bytes, ...], then: Iterable[byt
         yield from then
 
     device = Device(clock, answers())
-    station = Station(listen_s=0.0, monotonic=clock, open_bus=lambda url: device)  # type: ignore[arg-type, return-value]
+    station = Station(listen_s=0.0, monotonic=clock, open_bus=lambda url: device)
     return Tuner("one", NODE, None, station=station), device
 
 
@@ -111,7 +114,7 @@ def test_what_fits_together_is_the_value(clock: Clock, frames: tuple[bytes, ...]
         ((begun(21), b"\xe0"), Abort.COMMAND),
     ],
 )
-def test_what_does_not_is_refused_and_the_device_is_told(clock: Clock, frames: tuple[bytes, ...], code: Abort) -> None:
+def test_what_does_not_is_refused_and_aborted(clock: Clock, frames: tuple[bytes, ...], code: Abort) -> None:
     tuner, device = reading(clock, *frames)
     with pytest.raises(TunerError, match=r"device_name: the segments of node 20h \(32\) do not make a value") as caught:
         tuner.read("device_name")
@@ -166,7 +169,9 @@ def test_a_value_without_an_end_ends(clock: Clock, size: int | None) -> None:
     assert len(device.sent) <= 2 + LONGEST // 7 + 1
 
 
-def test_a_device_that_takes_its_time_with_each_segment_is_given_up(clock: Clock) -> None:
+def test_a_device_that_takes_its_time_with_each_segment_is_given_up(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tuner, device = reading(clock, begun(LONGEST), then=cycle((b"\x0cL", b"\x1co")))
     send, began = device.send, clock.now
 
@@ -174,7 +179,7 @@ def test_a_device_that_takes_its_time_with_each_segment_is_given_up(clock: Clock
         clock.now += 0.2
         send(can_id, data)
 
-    device.send = late  # type: ignore[method-assign]
+    monkeypatch.setattr(device, "send", late)
     with pytest.raises(TunerError) as caught:
         tuner.read("device_name")
     assert caught.value.kind is FailureKind.TIMEOUT
