@@ -97,9 +97,10 @@ class Looking:
     def look_at_due_loops(self) -> list[str]:
         """Looks at every loop whose time has come and whose set-point was changed. Returns their tags. Raises
         SQLAlchemyError, FolderInUse."""
-        if self._wall() < self._latest_s:  # the clock was put back, and with it the history
+        began_s = self._wall()
+        if began_s < self._latest_s:  # the clock was put back, and with it the history
             self._loops = {tag: _Loop() for tag in self._loops}
-        self._latest_s = self._wall()
+        self._latest_s = began_s
         looked = []
         for config in self._directory.loops.values():
             if self._stopping():
