@@ -42,7 +42,7 @@ class Emergencies:
             return
         self._errors.append(error)
         self._history = [int(code), *self._history][:_MAX_REMEMBERED]
-        self._tell(EMCY_FRAME.pack(code, EMCY_REGISTER[code], detail[:5]))
+        self._send_after_the_unsent(EMCY_FRAME.pack(code, EMCY_REGISTER[code], detail[:5]))
 
     def clear_error(self, code: Emcy, source: bytes | None = None) -> None:
         """Ends the error of one source, or of all, and reports it by EMCY 0000h with the register of the remaining
@@ -50,9 +50,9 @@ class Emergencies:
         left = [error for error in self._errors if error[0] != code or source not in (None, error[1])]
         if len(left) < len(self._errors):
             self._errors = left
-            self._tell(EMCY_FRAME.pack(Emcy.ERROR_GONE, self._register(), b""))
+            self._send_after_the_unsent(EMCY_FRAME.pack(Emcy.ERROR_GONE, self._register(), b""))
 
-    def _tell(self, frame: bytes) -> None:
+    def _send_after_the_unsent(self, frame: bytes) -> None:
         self._unsent.append(frame)
         self.send_unsent()
 

@@ -12,7 +12,8 @@ class Patience:
     """The waits for one frame, in wall time. Who has stood still itself still gets what has come meanwhile.
 
     give_up: time after which only what is here already is received.
-    take_in_s: for how long it is, s: where a node babbles, or the bus is overloaded, there is always another frame.
+    take_in_s: for how long it is, s: where a node sends without a pause, or the bus is overloaded, there is always
+        another frame.
     """
 
     def __init__(self, give_up: float, take_in_s: float) -> None:

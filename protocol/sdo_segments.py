@@ -57,7 +57,7 @@ class SegmentedUpload:
         return True
 
     def _check_length(self, part: bytes) -> None:
-        most = LONGEST if self._announced is None else self._announced
+        maximum = LONGEST if self._announced is None else self._announced
         is_short = self.over and self._announced is not None and len(self.value) < self._announced
-        if len(self.value) > most or is_short or not (part or self.over):
+        if len(self.value) > maximum or is_short or not (part or self.over):
             raise SdoAbort(Abort.LENGTH)

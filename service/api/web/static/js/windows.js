@@ -5,7 +5,7 @@
  */
 
 /** One connection is left for the next page, and for what is asked of the service. */
-const MOST_STREAMS = 5;
+const MAX_STREAMS = 5;
 
 /** @typedef {{said: "opened" | "open" | "crowded", by: string, to?: string}} Message */
 
@@ -33,7 +33,7 @@ export class Windows {
   /** @param {string} by */
   count(by) {
     this.others.add(by);
-    if (this.others.size + 1 <= MOST_STREAMS) return;
+    if (this.others.size + 1 <= MAX_STREAMS) return;
     this.others.clear();
     this.say("crowded");
   }
