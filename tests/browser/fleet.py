@@ -15,8 +15,9 @@ import yaml
 
 from loopwright.protocol.profile import CONTROLLER_NODE, PLANT_NODE, ParameterCommand
 from loopwright.protocol.tuner import Tuner
-from tests.browser.site import Site, free_port
+from tests.browser.site import Site
 from tests.forked import ForkedProcess
+from tests.ports import free_port
 
 
 @dataclass(frozen=True)

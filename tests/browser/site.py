@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 from tests.e2e.plantsite import MODEL_14, Plantsite
 from tests.forked import ForkedProcess
+from tests.ports import free_port
 
 CASE = MODEL_14
 TAG = "TIC-101"
@@ -69,9 +69,3 @@ class Site(Plantsite):
         """The latest job."""
         job: dict[str, Any] = self.ask("/jobs?limit=1")[0]
         return job
-
-
-def free_port() -> int:
-    """A port of this machine at which nobody listens."""
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        return int(found.getsockname()[1])

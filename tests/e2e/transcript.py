@@ -11,7 +11,6 @@ import os
 import re
 import secrets
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -20,6 +19,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Self
+
+from tests.ports import free_port
 
 COLUMNS = 116
 _BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -126,7 +127,7 @@ class Shell:
 
     def __init__(self, folder: Path, ports: tuple[int, ...]) -> None:
         self._folder = folder
-        self._ports = {str(port): str(_free_port()) for port in ports}
+        self._ports = {str(port): str(free_port()) for port in ports}
         self._ids: dict[str, str] = {}
         self._background = 0
         environment = {name: value for name, value in os.environ.items() if not name.startswith("LOOPWRIGHT_")}
@@ -207,9 +208,3 @@ class Shell:
             text = pattern.sub(shown, text)
         text = "\n".join(line.rstrip() for line in text.splitlines())
         return f"{text}\n" if text else ""
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port: int = server.getsockname()[1]
-        return port

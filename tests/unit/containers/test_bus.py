@@ -16,6 +16,7 @@ import pytest
 
 from loopwright.containers import bus, keeper
 from loopwright.protocol.bus import open_bus
+from tests.ports import free_port
 
 # The kernel's answers to the first netlink message, wherever the test runs.
 RUN = """
@@ -31,11 +32,6 @@ vcan._ask = answer
 sys.exit(bus.main(sys.argv[5:]))
 """
 NO_MODULE, NO_RIGHT = 95, 1  # EOPNOTSUPP, EPERM
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        return int(found.getsockname()[1])
 
 
 def start(answer: int, kind: str, ports: tuple[int, int, int] = (1, 1, 1)) -> subprocess.Popen[str]:

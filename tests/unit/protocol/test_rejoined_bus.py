@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import socket
 import subprocess
 import sys
 import threading
@@ -17,6 +16,7 @@ from loopwright.protocol.bus_state import BusState
 from loopwright.protocol.hub import Hub
 from loopwright.protocol.profile import CONTROLLER_NODE, heartbeat_id
 from loopwright.protocol.rejoined_bus import RejoinedBus, open_device_bus
+from tests.ports import free_port
 from tests.unit.service.processes import until
 
 PATIENCE_S = 60.0
@@ -36,8 +36,7 @@ def serving(port: int) -> Iterator[Hub]:
 
 @pytest.fixture
 def port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return int(free.getsockname()[1])
+    return free_port()
 
 
 def until_lost(bus: Bus) -> str:

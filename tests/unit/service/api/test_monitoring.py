@@ -6,7 +6,6 @@ import importlib.util
 import json
 import re
 import shutil
-import socket
 import subprocess
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -20,6 +19,7 @@ from fastapi.testclient import TestClient
 from grafana_foundation_sdk.models.dashboard import Dashboard
 
 from loopwright.service.api.app import create_app
+from tests.ports import free_port
 from tests.unit.service.fakes import Service
 from tests.unit.service.processes import until
 from tests.unit.service.served import served
@@ -59,12 +59,6 @@ def test_promtool_accepts_the_alert_rules(command: tuple[str, ...]) -> None:
 def test_every_alert_says_what_to_do() -> None:
     for rule in RULES:
         assert rule["annotations"]["summary"] and rule["annotations"]["action"] and rule["labels"]["severity"]
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture

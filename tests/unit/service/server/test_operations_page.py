@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ from urllib.parse import quote
 
 import pytest
 
+from tests.ports import free_port
 from tests.unit.service.postgres import Server, binaries
 
 ROOT = Path(__file__).parents[4]
@@ -49,8 +49,7 @@ class Machine:
         self.folder = folder
         for name in ("etc/systemd/system", "etc/sysctl.d", "opt", "usr/local/bin", "var/lib", "var/backups", "run"):
             (folder / name).mkdir(parents=True)
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self.port = free.getsockname()[1]
+        self.port = free_port()
         work = folder / "clone"
         (work / "tools").mkdir(parents=True)
         shutil.copy(UNIT, work / "tools")
