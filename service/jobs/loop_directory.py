@@ -126,10 +126,12 @@ class LoopDirectory:
                 began_s, state = loop.began_s, loop.latest
                 if state is None:
                     return None
-                return InEffect(began_s, state.sp, state.mode, state.on_trial, astuple(state.gains))
+                return InEffect(
+                    began_s, state.sp, state.mode, state.on_trial, astuple(state.gains), state.sample_time_s
+                )
         began_s, state = time.time(), self.read(tag)
         gains = None if state.on_trial else astuple(state.gains)  # those that another tuner tries are not read
-        return InEffect(began_s, state.sp, state.mode, state.on_trial, gains)
+        return InEffect(began_s, state.sp, state.mode, state.on_trial, gains, state.sample_time_s)
 
     def present(self, tag: str) -> LoopState:
         """Returns the loop as its controller has it, or as it was at the start of the running job. Raises Ended."""

@@ -27,6 +27,7 @@ class InEffect:
     """What a reading of a loop, begun at this time, has found.
 
     gains: None where they cannot be known, because another tuner has gains on trial.
+    sample_time_s: the sampling period that the controller has been given, s of plant time.
     """
 
     began_s: float
@@ -34,6 +35,7 @@ class InEffect:
     mode: int
     on_trial: bool
     gains: GainSet | None
+    sample_time_s: float
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class HeardLoop:
         self._data = ProcessData()
         self._last_n: int | None = None
         self._heard_s = self._read_s = -math.inf
-        self._period_s = 0.0
+        self._period_s = self._sample_time_s = 0.0
         self._forget(-math.inf)
 
     def _forget(self, at_s: float) -> None:
@@ -96,7 +98,7 @@ class HeardLoop:
         passed = 0 if self._last_n is None else samples_between(self._last_n, n)
         if passed == 1 and not self._period_s:
             self._period_s = silence_s
-        gap = passed != 1 or silence_s > max(SILENCE_S, 3.0 * self._period_s)
+        gap = passed != 1 or silence_s > self._silence_s
         if gap:
             self._forget(at_s)
         if passed == 1:  # at most doubled: a single silence is no period
@@ -118,6 +120,7 @@ class HeardLoop:
 
     def learn(self, found: InEffect, now_s: float) -> None:
         """Takes a reading. One that something has overtaken meanwhile is dropped, and the loop is read again."""
+        self._sample_time_s = found.sample_time_s
         on_trial_since = self._status_known and found.on_trial != self._data.on_trial
         if self._changed_s >= found.began_s or self.silent_from_s(now_s) < now_s or on_trial_since:
             return
@@ -151,4 +154,9 @@ class HeardLoop:
 
     def silent_from_s(self, now_s: float) -> float:
         """Returns the time of the last sample where further ones are due; infinite while they come."""
-        return self._heard_s if now_s - self._heard_s > max(SILENCE_S, 3.0 * self._period_s) else math.inf
+        return self._heard_s if now_s - self._heard_s > self._silence_s else math.inf
+
+    @property
+    def _silence_s(self) -> float:
+        # until two samples have come, the period is what the controller has been told
+        return max(SILENCE_S, 3.0 * (self._period_s or self._sample_time_s))

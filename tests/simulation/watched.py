@@ -60,7 +60,9 @@ class SimListening:
         if self._loop.to_read(now_s) and controller.is_on and self._world.wire.state is State.UP:
             channel = controller.device.sessions[0].channel
             gains = None if channel.on_trial else astuple(channel.accepted)
-            self._loop.learn(InEffect(now_s, channel.setpoint, int(channel.mode), channel.on_trial, gains), now_s)
+            mode, sample_time_s = int(channel.mode), self._world.loop.sample_time_s
+            found = InEffect(now_s, channel.setpoint, mode, channel.on_trial, gains, sample_time_s)
+            self._loop.learn(found, now_s)
             if gains is not None:
                 self._read = Gains(*gains), now_s
         latest = self._loop.latest(now_s)

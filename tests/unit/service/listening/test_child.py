@@ -140,7 +140,7 @@ def test_loops_that_are_heard_and_not_read_are_named(child: Child, time: Time) -
     assert child.report().to_read == ["A"]
     began_s = time.wall + 0.05
     time.pass_by(0.1)
-    child.learn(Learn("A", InEffect(began_s, 50.0, Mode.AUTOMATIC, False, (1.0,) * 6)))
+    child.learn(Learn("A", InEffect(began_s, 50.0, Mode.AUTOMATIC, False, (1.0,) * 6, 0.1)))
     take(child, "B", 1)
     report = child.report()
     assert report.to_read == ["B"] and report.frames == {URL: 2}
@@ -154,7 +154,7 @@ def test_a_reading_from_before_a_change_is_dropped_whatever_the_clocks_say(child
     time.pass_by(0.05)
     child.buses[URL].take(IDS["A"].status, STATUS_FRAME.pack(Mode.AUTOMATIC, 0, 50.0, 0, 0))
     time.pass_by(0.01)
-    child.learn(Learn("A", InEffect(began_s, 50.0, Mode.AUTOMATIC, False, (1.0,) * 6)))
+    child.learn(Learn("A", InEffect(began_s, 50.0, Mode.AUTOMATIC, False, (1.0,) * 6, 0.1)))
     assert child.report().to_read == ["A"]
 
 

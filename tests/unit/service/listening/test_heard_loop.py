@@ -15,7 +15,7 @@ from loopwright.service.listening.heard_loop import READ_AGAIN_S, SILENCE_S, Hea
 
 T0 = 1_769_860_800.0
 ONE = (1.5, 20.0, 0.0, 0.0, 1.0, 0.0)
-FOUND = InEffect(T0 - 1.0, 50.1, Mode.AUTOMATIC, False, ONE)
+FOUND = InEffect(T0 - 1.0, 50.1, Mode.AUTOMATIC, False, ONE, 0.1)
 
 
 class Bus:
@@ -123,6 +123,25 @@ def test_a_loop_whose_samples_are_farther_apart_than_a_silence_is_heard(bus: Bus
     assert not bus.gaps and bus.bins["gains"][-1]
     assert bus.loop.silent_from_s(bus.at_s + 2.0 * period_s) == math.inf
     assert bus.loop.silent_from_s(bus.at_s + 4.0 * period_s) < math.inf
+
+
+def test_until_the_second_sample_the_period_is_what_the_controller_has_been_told(bus: Bus) -> None:
+    bus.sample(1)
+    assert bus.loop.silent_from_s(bus.at_s + SILENCE_S + 0.1) == bus.at_s
+    bus.read(sample_time_s=5.0)
+    first_s = bus.at_s
+    assert bus.loop.silent_from_s(first_s + 14.0) == math.inf
+    assert bus.loop.silent_from_s(first_s + 16.0) < math.inf
+    bus.sample(2, seconds=5.0)
+    assert not bus.gaps and bus.bins["gains"][-1]
+
+
+def test_samples_that_come_faster_than_the_controller_says_count(bus: Bus) -> None:
+    """As those of a simulated plant do that runs ahead of the clock."""
+    bus.sample(1)
+    bus.read(sample_time_s=5.0)
+    bus.sample(2)
+    assert bus.loop.silent_from_s(bus.at_s + SILENCE_S + 0.1) == bus.at_s
 
 
 def test_a_loop_that_is_made_slower_is_heard_again_and_a_single_silence_makes_none_slow(bus: Bus) -> None:

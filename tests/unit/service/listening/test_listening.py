@@ -174,7 +174,7 @@ def test_a_reading_of_gains_has_the_time_that_nobody_sets(store: Store, monkeypa
         monkeypatch.setattr(ListeningProcess, name, lambda process: None)
     site = parse_site({"loops": [loop_entry() | {"bus": "socketcan:can0"}]}, "test")
     clock_ahead_s = 4e9
-    listening = Listening(site.loops, store, lambda tag: InEffect(clock_ahead_s, 50.0, 2, False, ONE))
+    listening = Listening(site.loops, store, lambda tag: InEffect(clock_ahead_s, 50.0, 2, False, ONE, 0.1))
     monkeypatch.setattr(listening, "_to_read", (TAG,))
     before_s = uptime_s()
     listening.start()
