@@ -36,7 +36,7 @@ from loopwright.service.api import live as live_api
 from loopwright.service.api.aborts import stopping
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.events import event_stream, still_permitted
-from loopwright.service.api.gate.access_log import Access
+from loopwright.service.api.gate.access_log import Access, count_failures_of
 from loopwright.service.api.gate.gate import Gate, Policy
 from loopwright.service.api.gate.key_checks import KeyChecks
 from loopwright.service.api.heads import Head
@@ -389,4 +389,5 @@ def create_app(
     figures = figures or KeptFigures(jobs.store, pool)
     add(app, job_figures.router(jobs, figures))
     add(app, reports.router(jobs, figures, pool, view))
+    count_failures_of(app.routes)
     return app

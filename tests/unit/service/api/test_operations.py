@@ -173,6 +173,17 @@ def test_samples_lost_are_counted_from_0_on(service: Service) -> None:
     jobs.stop()
 
 
+def test_answers_500_are_counted_from_0_on(client: TestClient) -> None:
+    found = {
+        (labels["method"], labels["route"])
+        for name, pairs in samples(client)
+        if name == "loopwright_http_requests_total" and (labels := dict(pairs))["status"] == "500"
+    }
+    operations = client.get("/openapi.json").json()["paths"]
+    assert {(method.upper(), path) for path, each in operations.items() for method in each} <= found
+    assert ("GET", "none") in found
+
+
 def test_stages_requests_and_samples_are_counted(service: Service, client: TestClient) -> None:
     before = samples(client)
     finished(service, client)
