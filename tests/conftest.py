@@ -29,6 +29,7 @@ _STARTERS = {
     "loopwright.service.server.serving",
     "loopwright.service.execution.computing.pool",
 }
+_ONLY_COMPUTING = ("tests/rehearsal/", "tests/unit/tuning/", "tests/unit/validation/")
 
 _COUNTS = pytest.StashKey[dict[str, Counter[str]]]()
 
@@ -43,7 +44,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Marks what may fail where processes start slowly: `python -m tests.repeat` repeats it beside a load."""
+    """Marks what may fail where processes start slowly: `python -m tests.repeat` repeats it beside a load.
+
+    What only computes comes last: at the end, when other work of this machine is through, tests that wait would leave
+    the processors idle.
+    """
     by_default, each_once = not config.getoption("--all-on-vcan"), config.getoption("--each-once")
     left_out = [
         item
@@ -58,6 +63,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if isinstance(item, pytest.Function) and starts_processes(item.module):
             item.add_marker(pytest.mark.starts_processes)
+    items.sort(key=lambda item: item.nodeid.startswith(_ONLY_COMPUTING))
 
 
 def pytest_collection_finish() -> None:
