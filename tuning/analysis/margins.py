@@ -22,6 +22,8 @@ from loopwright.tuning.reasons import Reason, Refused
 POINTS_PER_DECADE = 600
 COARSE = 0.1
 """The turn of the dead time between two points of the grid from which the peak may lie between them, rad."""
+LIGHT = 0.01
+"""The damping ratio of a pole or zero below which the grid is refined about it: its phase turns between few points."""
 CROSSINGS = 40
 """The crossings that are looked at: of more, those with the largest gain."""
 
@@ -73,7 +75,10 @@ def margins(model: Model, gains: Gains) -> Margins:
     def at(w: float) -> complex:
         return complex(loop(np.array([w]))[0])
 
-    w = _grid(model, N, D)
+    roots = np.concatenate((np.roots(N), np.roots(D)))
+    w = _grid(model, N, D, roots)
+    if len(modes := _modes(roots)):
+        w = np.union1d(w, modes)
     L = loop(w)
 
     def nearness(x: float) -> float:
@@ -140,10 +145,10 @@ def ultimate_point(model: Model) -> tuple[float, float]:
     return found.GM, 2.0 * math.pi / found.wpc
 
 
-def _grid(model: Model, N: Reals, D: Reals) -> Reals:
+def _grid(model: Model, N: Reals, D: Reals, roots: Complexes) -> Reals:
     """The frequency grid, rad/s, from well below the slowest to well above the fastest corner of the loop, and to a
-    decade beyond the gain crossover where a high gain moves that farther up."""
-    corners = [float(x) for x in np.abs(np.concatenate((np.roots(N), np.roots(D)))) if x > 0.0]
+    decade beyond the gain crossover where a high gain moves that farther up. roots: those of N and D."""
+    corners = [float(x) for x in np.abs(roots) if x > 0.0]
     kept = np.trim_zeros(D, "b")
     origin = len(D) - len(kept)
     if origin:
@@ -159,6 +164,17 @@ def _grid(model: Model, N: Reals, D: Reals) -> Reals:
     if end <= high:
         return w
     return np.concatenate((w, np.geomspace(high, end, int(POINTS_PER_DECADE * math.log10(end / high)) + 2)[1:]))
+
+
+def _modes(roots: Complexes) -> Reals:
+    """Frequencies about every lightly damped pole and zero, rad/s, between which its phase turns by a degree."""
+    found = [np.empty(0)]
+    for root in roots:
+        width = abs(float(root.real))
+        if 0.0 < width < LIGHT * float(root.imag):
+            end = math.atan(2.0 * LIGHT * float(root.imag) / width)
+            found.append(float(root.imag) + width * np.tan(np.linspace(-end, end, 201)))
+    return np.concatenate(found)
 
 
 def _turn(model: Model, w: Reals, L: Complexes, minimum: float) -> Reals:
@@ -212,5 +228,7 @@ def _min(f: Callable[[float], float], w: Reals, at: int) -> tuple[float, float]:
     """The minimum of f near the grid point `at`, as (frequency, value)."""
     if at in (0, len(w) - 1):
         return float(w[at]), f(float(w[at]))
-    found = minimize_scalar(f, bounds=(w[at - 1], w[at + 1]), method="bounded", options={"xatol": 1e-7 * float(w[at])})
+    low, high = float(w[at - 1]), float(w[at + 1])
+    xatol = min(1e-7 * float(w[at]), 1e-3 * (high - low))
+    found = minimize_scalar(f, bounds=(low, high), method="bounded", options={"xatol": xatol})
     return float(found.x), float(found.fun)

@@ -150,6 +150,21 @@ def test_a_peak_between_two_turns_of_the_dead_time() -> None:
     assert found.stable and found.Ms == pytest.approx(peak, rel=1e-3)
 
 
+@pytest.mark.parametrize("zeta", [1e-3, 1e-4, 1e-5])
+def test_a_mode_narrower_than_the_grid(zeta: float) -> None:
+    """An integrating plant with a resonance: its phase turns by half a turn within a part zeta of the frequency."""
+    model = TransferFunction((1.0,), (1.0 / 7.3**2, 2.0 * zeta / 7.3, 1.0, 0.0), 0.04)
+    w = 7.3 * (1.0 + 20.0 * zeta * np.linspace(-1.0, 1.0, 400_001))
+    L = model.frequency_response(w)
+    at = np.flatnonzero(np.diff(np.sign(L.imag)))
+    Ku, Pu = ultimate_point(model)
+    assert pytest.approx(1.0 / np.abs(L[at[0]]), rel=1e-4) == Ku
+    assert 2.0 * math.pi / Pu == pytest.approx(w[at[0]], rel=1e-6)
+    assert margins(model, Gains(0.99 * Ku)).stable and not margins(model, Gains(1.01 * Ku)).stable
+    peak = float(np.max(np.abs(0.8 * Ku * L / (1.0 + 0.8 * Ku * L))))
+    assert margins(model, Gains(0.8 * Ku)).Mt == pytest.approx(peak, rel=1e-4)
+
+
 def test_a_plant_without_ultimate_point_is_refused() -> None:
     with pytest.raises(Refused) as refused:
         ultimate_point(TransferFunction((1.0,), (2.0, 3.0, 1.0)))
