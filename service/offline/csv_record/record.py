@@ -17,6 +17,7 @@ import numpy as np
 from loopwright.service.offline.csv_record.decimal_signs import decimal_signs, shown_signs
 from loopwright.service.offline.csv_record.errors import RecordError, Unusable, counted
 from loopwright.service.offline.csv_record.numbers import numbers
+from loopwright.service.offline.csv_record.qualities import bad_values
 from loopwright.service.offline.csv_record.sampling import sampled
 from loopwright.service.offline.csv_record.table import Table, read_table
 from loopwright.service.offline.csv_record.text import decoded
@@ -96,10 +97,13 @@ def _record(table: Table, options: ReadOptions) -> Record:
     called["t"] = called["t"] or "the first column"
     numeric = {each: cells[each] for each in cells if each != "t" or are_numbers(cells["t"], options.time_format)}
     decimal, notes = decimal_signs(numeric, called, table.delimiter)
+    bad, marked = bad_values(at, names, table.rows)
+    notes += marked
     for quantity in ("u", "y", "sp"):
         if quantity in at:
             values[quantity], wrong = numbers(cells[quantity], decimal[quantity])
             problems += _no_numbers(called[quantity], cells[quantity], [table.lines[i] for i in wrong], wrong)
+            values[quantity][bad[quantity]] = np.nan
     try:
         unit = table.columns.units.get("t", "")
         t = seconds(cells["t"], table.lines, unit, options.time_format, called["t"], decimal.get("t", "."))

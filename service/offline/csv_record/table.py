@@ -55,7 +55,7 @@ def read_table(text: str, chosen: Mapping[str, str]) -> Table:
     kept: list[int] = []
     rows: list[list[str]] = []
     for (line, _), cells in zip(body, _all_cells([text for _, text in body], delimiter), strict=True):
-        if (fitted := cells if len(cells) == width else _fitted(cells, width)) is None:
+        if (fitted := cells if len(cells) == width else _fitted(cells, width, delimiter)) is None:
             wrong.append(line)
         else:
             kept.append(line)
@@ -106,11 +106,13 @@ def _all_cells(lines: Sequence[str], delimiter: str) -> list[list[str]]:
     return [next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), []) for line in lines]
 
 
-def _fitted(cells: list[str], width: int) -> list[str] | None:
-    """The cells of a line with delimiters too many or one too few at its end; None where the values do not fit."""
+def _fitted(cells: list[str], width: int, delimiter: str) -> list[str] | None:
+    """The cells of a line with delimiters too many or one too few at its end; None where the values do not fit.
+
+    Between spaces no cell is empty: of a value that is missing nothing shows that it was the last one."""
     if len(cells) > width and not any(cell.strip() for cell in cells[width:]):
         return cells[:width]
-    return [*cells, ""] if len(cells) == width - 1 and width > 2 and cells else None
+    return [*cells, ""] if len(cells) == width - 1 and width > 2 and delimiter != " " else None
 
 
 def _is_sample(cells: Sequence[str], columns: Columns) -> bool:

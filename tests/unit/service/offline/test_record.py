@@ -408,6 +408,37 @@ def test_resampling_keeps_what_mv_did_to_the_plant() -> None:
     assert "PV every 2 s, at most 2.5 s apart" in record.notes[0]
 
 
+@pytest.mark.parametrize(
+    ("header", "line", "bad", "lacking"),
+    [
+        ("t,u,y,Quality", "{k},1,{y},{q}", ("Good", "Bad"), {"u", "y"}),
+        ("t,u,u_q,y,y_q", "{k},1,192,{y},{q}", ("192", "24"), {"y"}),
+        ("t,u,TIC 1.PV (degC),TIC 1.PV Status", "{k},1,{y},{q}", ("OK", "Bad: sensor failure"), {"y"}),
+        ("t,u,Quality,y,Quality", "{k},1,Good,{y},{q}", ("Good", "BAD"), {"y"}),
+        ("t,y,u,Status", "{k},{y},1,{q}", ("1", "0"), set()),  # of no known meaning
+        ("t,u,y,q", "{k},1,{y},{q}", ("150.5", "3.2"), set()),  # a flow of heat
+    ],
+)
+def test_values_of_bad_quality_are_none(header: str, line: str, bad: tuple[str, str], lacking: set[str]) -> None:
+    lines = [line.format(k=k, y=0 if k in (30, 31) else k, q=bad[k in (30, 31)]) for k in range(60)]
+    record = parse_record("\n".join([header, *lines]), "log.csv")
+    assert values(record.y[29:33]) == ([29.0, 30.0, 31.0, 32.0] if lacking else [29.0, 0.0, 0.0, 32.0])
+    if not lacking:
+        assert record.notes == ()
+        return
+    whose = " and ".join(record.names[each] for each in sorted(lacking))
+    assert record.notes[0].startswith(f"2 lines mark {whose} as bad (") and "2 samples without" in record.notes[1]
+    many = [line.format(k=k, y=k, q=bad[20 <= k < 40]) for k in range(60)]
+    with pytest.raises(RecordError, match="20 samples in a row have no value, from 20 s on"):
+        parse_record("\n".join([header, *many]), "log.csv")
+
+
+def test_between_spaces_a_value_that_is_missing_moves_no_other_into_its_column() -> None:
+    lines = [f"{k}  {'' if k == 30 else 35}  {60 + k}" for k in range(60)]
+    with pytest.raises(RecordError, match="line 32: values are missing, or too many: line 1 names 3 columns"):
+        parse_record("\n".join(["t u y", *lines]), "log.csv")
+
+
 def test_nothing_to_resample() -> None:
     for text in ("t,u,y\n0,Bad,Bad\n1,Bad,Bad\n", "t,u,y\n0,1,Bad\n1,1,2\n"):
         with pytest.raises(RecordError, match="there is nothing to resample"):
