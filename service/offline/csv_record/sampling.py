@@ -199,7 +199,7 @@ def _resampled(t: Reals, values: Mapping[str, Reals], Ts: float, notes: list[str
     if any(len(each) < 2 for each in there.values()):
         raise Unusable("a column has fewer than two values: there is nothing to resample")
     start = max(float(each[0]) for each in there.values())
-    stop = float(t[-1])
+    stop = float(there["y"][-1])  # nothing is known of PV after its last value
     count = int((stop - start) / Ts + 1e-9) + 1
     if count > MAX_SAMPLES:
         raise Unusable(f"--resample would make {count} samples; at most {MAX_SAMPLES} are possible: ask for fewer")

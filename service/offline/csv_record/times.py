@@ -170,13 +170,14 @@ def _days(dates: set[tuple[str, str, str, str]], order: str) -> dict[tuple[str, 
     epoch, found = datetime(1970, 1, 1), {}
     for date in dates:
         first, second, third, sign = date
-        if (order == "year") != (len(first) == 4) or (order == "month" and sign == "."):
+        whole_year, short_years = len(first) == 4, len(first) == len(third) == 2
+        if (order == "month" and sign == ".") or (not (whole_year or short_years) if order == "year" else whole_year):
             return None
         try:
             month = _MONTHS.get(second[:3].lower())
             match order:
                 case "year":
-                    day = datetime(int(first), month or int(second), int(third))
+                    day = datetime(_year(first), month or int(second), int(third))
                 case "day":
                     day = datetime(_year(third), month or int(second), int(first))
                 case _:

@@ -55,6 +55,14 @@ def test_dates(zone: str) -> None:
     assert values(record.t) == [0.0, 0.5, 1.0]
 
 
+@pytest.mark.parametrize(
+    ("before", "after"), [("25/11/30", "25/12/01"), ("30/11/25", "01/12/25"), ("11/30/25", "12/01/25")]
+)
+def test_over_midnight_two_digits_of_the_year_may_come_first_or_last(before: str, after: str) -> None:
+    record = parse_record(f"time,u,y\n{before} 23:59:59,1,2\n{after} 00:00:00,1,2\n{after} 00:00:01,1,2\n", "test")
+    assert values(record.t) == [0.0, 1.0, 2.0]
+
+
 def test_a_clock_without_a_zone_knows_no_summer_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TZ", "Europe/Berlin")
     time.tzset()
@@ -406,6 +414,12 @@ def test_resampling_keeps_what_mv_did_to_the_plant() -> None:
     assert (values(record.t), values(record.u)) == ([0.0, 2.0, 4.0, 6.0], [1.0, 4.0, 4.0, 4.0])
     assert values(record.y) == [0.0, 4.0, 8.0, 12.0]
     assert "PV every 2 s, at most 2.5 s apart" in record.notes[0]
+
+
+def test_resampling_ends_with_the_last_value_of_pv() -> None:
+    lines = [f"{k},1,{'Bad' if k > 20 else k}" for k in range(60)]
+    record = parse_record("\n".join(["t,u,y", *lines]), "log.csv", ReadOptions(resample_s=1.0))
+    assert values(record.y) == [float(k) for k in range(21)]
 
 
 @pytest.mark.parametrize(
