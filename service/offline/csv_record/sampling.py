@@ -23,6 +23,8 @@ MAX_GAP = 3
 MAX_FILLED = 0.05
 """Largest part of the samples that is filled."""
 MAX_SAMPLES = 10_000_000
+_HOUR = 3600.0
+_IN_UTC = "export the times in UTC, or with their offset from it"
 _NEEDED = ("u", "y")
 """The columns by which a sample is missing."""
 _HELD = ("u", "sp")
@@ -87,12 +89,20 @@ def _without_repeated(t: Reals, values: Mapping[str, Reals], lines: Whole, notes
     wrong = [int(lines[i + 1]) for i in doubtful if int(i) + 1 not in repeated]
     if wrong:
         why = ": samples of the same time and other values; export fractions of a second, too"
-        same = all(steps[i] == 0.0 for i in doubtful)
-        raise Unusable(counted(wrong, "the time does not increase", "times do not increase") + (why if same else ""))
+        if len(doubtful) == 1 and _is_hour(float(steps[doubtful[0]]), -_HOUR, float(np.median(steps))):
+            why = f": the clock went back by an hour there, as at the end of summer time; {_IN_UTC}"
+        elif any(steps[i] != 0.0 for i in doubtful):
+            why = ""
+        raise Unusable(counted(wrong, "the time does not increase", "times do not increase") + why)
     if repeated:
         lines_left_out = _count(len(repeated), "line that repeats", "lines that repeat")
         notes.append(f"{lines_left_out} the one before {_were(len(repeated))} left out.")
     return [i for i in range(len(t)) if i not in repeated]
+
+
+def _is_hour(step: float, change: float, usual: float) -> bool:
+    """Whether a step between two times is the usual one and the change of a clock by an hour."""
+    return abs(step - change - usual) < usual
 
 
 def _same(a: float, b: float) -> bool:
@@ -109,10 +119,12 @@ def _rows_filled_in(t: Reals, values: Mapping[str, Reals], lines: Whole) -> tupl
     gaps = np.flatnonzero(many - 1 > MAX_GAP)
     if len(gaps):
         worst = int(gaps[np.argmax(steps[gaps])])
+        summer_time = len(gaps) == 1 and _is_hour(float(steps[worst]), _HOUR, usual)
         raise Unusable(
             f"line {lines[worst + 1]}: {steps[worst]:.4g} s after the sample before, where {usual:.4g} s is usual "
             f"({_count(len(gaps), 'such gap', 'such gaps')}). At most {MAX_GAP} missing samples in a row are filled: "
             "use a part of the file without gaps, or --resample where the historian stores changes alone"
+            + (f". If it is the hour that the clock leaves out as summer time begins, {_IN_UTC}" if summer_time else "")
         )
     uneven = np.flatnonzero(np.abs(steps - many * usual) > UNEVEN * usual)
     if len(uneven):
@@ -216,6 +228,8 @@ def _resampled(t: Reals, values: Mapping[str, Reals], Ts: float, notes: list[str
         "PV in a straight line, MV and set-point held. A move of MV is taken as made at the time of the line that "
         "shows it first; the dead time comes out short by as much as the line was late."
     )
+    if _is_hour(longest, _HOUR, usual):
+        notes.append(f"PV has no value for an hour. If it is the one left out as summer time begins, {_IN_UTC}.")
     if longest > 5.0 * Ts:
         notes.append("Where PV is far between, the record shows straight lines, and the fit knows less than it says.")
     return EvenSamples(grid - grid[0], columns, tuple(notes))

@@ -74,6 +74,19 @@ def test_a_clock_without_a_zone_knows_no_summer_time(monkeypatch: pytest.MonkeyP
     assert values(record.t) == [0.0, 3601.0]
 
 
+def test_an_hour_that_the_clock_leaves_out_or_has_twice_is_named() -> None:
+    def lines(first: str, then: str) -> str:
+        return "time,u,y\n" + "".join(f"2024-{hour}:{k:02}:00,1,{k}\n" for hour in (first, then) for k in range(60))
+
+    with pytest.raises(RecordError, match=r"line 62: the time does not increase: the clock went back.* in UTC"):
+        parse_record(lines("10-27T02", "10-27T02"), "log.csv")
+    spring = lines("03-31T01", "03-31T03")
+    with pytest.raises(RecordError, match=r"line 62: 3660 s after the sample before.* as summer time begins, export"):
+        parse_record(spring, "log.csv")
+    record = parse_record(spring, "log.csv", ReadOptions(resample_s=60.0))
+    assert "PV has no value for an hour. If it is the one left out as summer time begins" in record.notes[1]
+
+
 def test_a_file_with_a_byte_order_mark(tmp_path: Path) -> None:
     file = tmp_path / "record.csv"
     file.write_bytes(b"\xef\xbb\xbft,u,y\n0,1,2\n1,1,3\n")
