@@ -8,7 +8,7 @@ All errors of a file are reported at once, each kind with its number and its fir
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -103,6 +103,8 @@ def _record(table: Table, options: ReadOptions) -> Record:
         if quantity in at:
             values[quantity], wrong = numbers(cells[quantity], decimal[quantity])
             problems += _no_numbers(called[quantity], cells[quantity], [table.lines[i] for i in wrong], wrong)
+            if options.resample_s is not None and quantity != "y":
+                notes += _held(called[quantity], cells[quantity], values[quantity], table.lines)
             values[quantity][bad[quantity]] = np.nan
     try:
         unit = table.columns.units.get("t", "")
@@ -129,6 +131,19 @@ def _no_numbers(name: str, cells: list[str], lines: list[int], wrong: list[int])
     given = cells[wrong[0]].strip()
     many = f"values of {name} are not numbers, such as {given!r}"
     return [counted(lines, f"{name} is not a number: {given!r}", many)]
+
+
+def _held(name: str, cells: list[str], values: Reals, lines: Sequence[int]) -> list[str]:
+    """A note on the words in place of values of what holds between its values; an empty cell is no new value."""
+    words = [i for i, cell in enumerate(cells) if cell.strip() and np.isnan(values[i])]
+    if not words:
+        return []
+    count = f"{len(words)} lines have" if len(words) > 1 else "1 line has"
+    given = cells[words[0]].strip()
+    return [
+        f"{count} no value of {name}, such as {given!r} in line {lines[words[0]]}: the value before was held there, "
+        "whatever it was in truth."
+    ]
 
 
 def _time_cells(table: Table) -> list[str]:

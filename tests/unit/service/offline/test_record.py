@@ -429,6 +429,13 @@ def test_resampling_keeps_what_mv_did_to_the_plant() -> None:
     assert "PV every 2 s, at most 2.5 s apart" in record.notes[0]
 
 
+def test_resampling_says_where_mv_was_held_although_it_is_not_known() -> None:
+    lines = [f"{k},{'I/O Timeout' if 10 < k < 30 else '' if k % 2 else 1 + (k > 20)},{k}" for k in range(60)]
+    record = parse_record("\n".join(["t,u,y", *lines]), "log.csv", ReadOptions(resample_s=1.0))
+    assert record.notes[0].startswith("19 lines have no value of u, such as 'I/O Timeout' in line 13: the value before")
+    assert "no value" not in " ".join(record.notes[1:])
+
+
 def test_resampling_ends_with_the_last_value_of_pv() -> None:
     lines = [f"{k},1,{'Bad' if k > 20 else k}" for k in range(60)]
     record = parse_record("\n".join(["t,u,y", *lines]), "log.csv", ReadOptions(resample_s=1.0))
