@@ -108,7 +108,9 @@ def test_a_controller_of_an_older_version_is_refused_before_anything_moves(here:
     """Its order WATCH is missing, with which it is to end a test by itself."""
     restarted(here, "tests.e2e.older_controller")
     try:
-        here.put_in_manual()  # the one before may have been killed before it had stored its mode
+        # the controller before may not have stored its mode: this one begins in automatic, with another MV
+        here.at_rest(0.0)
+        here.put_in_manual()
         home = output(here)
         url = here.retune()
         job = here.finished(url)
