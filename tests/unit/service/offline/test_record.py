@@ -473,6 +473,12 @@ def test_between_spaces_a_value_that_is_missing_moves_no_other_into_its_column()
         parse_record("\n".join(["t u y", *lines]), "log.csv")
 
 
+def test_a_pv_that_ends_before_mv_begins_is_nothing_to_resample() -> None:
+    lines = [f"{k},{'' if k < 40 else 1},{k if k < 30 else ''}" for k in range(60)]
+    with pytest.raises(RecordError, match="PV has its last value at 29 s, and a column its first one only at 40 s"):
+        parse_record("\n".join(["t,u,y", *lines]), "log.csv", ReadOptions(resample_s=1.0))
+
+
 def test_nothing_to_resample() -> None:
     for text in ("t,u,y\n0,Bad,Bad\n1,Bad,Bad\n", "t,u,y\n0,1,Bad\n1,1,2\n"):
         with pytest.raises(RecordError, match="there is nothing to resample"):
