@@ -102,7 +102,7 @@ def _without_repeated(t: Reals, values: Mapping[str, Reals], lines: Whole, notes
 
 def _is_hour(step: float, change: float, usual: float) -> bool:
     """Whether a step between two times is the usual one and the change of a clock by an hour."""
-    return abs(step - change - usual) < usual
+    return abs(step - change - usual) < 0.5 * min(usual, _HOUR)
 
 
 def _same(a: float, b: float) -> bool:

@@ -85,6 +85,8 @@ def test_an_hour_that_the_clock_leaves_out_or_has_twice_is_named() -> None:
         parse_record(spring, "log.csv")
     record = parse_record(spring, "log.csv", ReadOptions(resample_s=60.0))
     assert "PV has no value for an hour. If it is the one left out as summer time begins" in record.notes[1]
+    with pytest.raises(RecordError, match=r"line 4: the time does not increase: samples of the same time and other"):
+        parse_record("time,u,y\n2024-10-25,1,1\n2024-10-26,1,2\n2024-10-26,1,3\n2024-10-27,1,4\n", "log.csv")
 
 
 def test_a_file_with_a_byte_order_mark(tmp_path: Path) -> None:
