@@ -27,7 +27,7 @@ class InEffect:
     """What a reading of a loop, begun at this time, has found.
 
     gains: None where they cannot be known, because another tuner has gains on trial.
-    sample_time_s: the sampling period that the controller has been given, s of plant time.
+    sample_time_s: the sampling period that the controller reports (1006h), s of plant time.
     """
 
     began_s: float
@@ -158,5 +158,5 @@ class HeardLoop:
 
     @property
     def _silence_s(self) -> float:
-        # until two samples have come, the period is what the controller has been told
+        # until two samples have come, the period is the one that the controller reports
         return max(SILENCE_S, 3.0 * (self._period_s or self._sample_time_s))

@@ -214,8 +214,8 @@ def _resampled(t: Reals, values: Mapping[str, Reals], Ts: float, notes: list[str
     stop = float(there["y"][-1])  # nothing is known of PV after its last value
     if stop <= start:
         raise Unusable(
-            f"PV has its last value at {stop:.6g} s, and a column its first one only at {start:.6g} s: there is nothing "
-            "to resample; export a time in which all of them have values"
+            f"PV has its last value at {stop:.6g} s, and a column its first one only at {start:.6g} s: there is "
+            "nothing to resample; export a time in which all of them have values"
         )
     count = int((stop - start) / Ts + 1e-9) + 1
     if count > MAX_SAMPLES:

@@ -125,7 +125,7 @@ def test_a_loop_whose_samples_are_farther_apart_than_a_silence_is_heard(bus: Bus
     assert bus.loop.silent_from_s(bus.at_s + 4.0 * period_s) < math.inf
 
 
-def test_until_the_second_sample_the_period_is_what_the_controller_has_been_told(bus: Bus) -> None:
+def test_until_the_second_sample_the_period_is_the_one_that_the_controller_reports(bus: Bus) -> None:
     bus.sample(1)
     assert bus.loop.silent_from_s(bus.at_s + SILENCE_S + 0.1) == bus.at_s
     bus.read(sample_time_s=5.0)
@@ -136,7 +136,7 @@ def test_until_the_second_sample_the_period_is_what_the_controller_has_been_told
     assert not bus.gaps and bus.bins["gains"][-1]
 
 
-def test_samples_that_come_faster_than_the_controller_says_count(bus: Bus) -> None:
+def test_samples_that_come_faster_than_the_controller_reports_count(bus: Bus) -> None:
     """As those of a simulated plant do that runs ahead of the clock."""
     bus.sample(1)
     bus.read(sample_time_s=5.0)
