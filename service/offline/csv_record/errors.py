@@ -35,3 +35,8 @@ def counted(lines: Sequence[int], one: str, many: str) -> str:
         return f"line {lines[0]}: {one}"
     shown = ", ".join(map(str, lines[:SHOWN_LINES]))
     return f"{len(lines)} {many}, {'first ' if len(lines) > SHOWN_LINES else ''}in lines {shown}"
+
+
+def number_of(count: int, one: str, many: str) -> str:
+    """Returns a number with the word for it: "1 line", "2 lines"."""
+    return f"{count} {one if count == 1 else many}"

@@ -10,13 +10,14 @@ import numpy as np
 
 from loopwright.tuning.models import Reals
 
-MISSING = frozenset(
+BAD_STATES = frozenset(
     {
-        "", "-", "--", "?", "na", "n/a", "#n/a", "nan", "null", "none", "missing", "bad", "bad input", "no data",
-        "nodata", "no value", "i/o timeout", "comm fail", "pt created", "shutdown", "intf shut", "scan off",
-        "calc failed", "not connect", "under range", "over range", "out of serv", "configure",
+        "bad", "bad input", "no data", "nodata", "no value", "i/o timeout", "comm fail", "pt created", "shutdown",
+        "intf shut", "scan off", "calc failed", "not connect", "under range", "over range", "out of serv", "configure",
     }
 )  # fmt: skip
+"""Why a historian had no good value, in small letters."""
+MISSING = BAD_STATES | {"", "-", "--", "?", "na", "n/a", "#n/a", "nan", "null", "none", "missing"}
 """What stands in small letters where a historian had no good value."""
 
 _THOUSANDS = {".": ",", ",": "."}

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.service.offline.csv_record.columns import split_unit
-from loopwright.service.offline.csv_record.numbers import numbers
+from loopwright.service.offline.csv_record.errors import number_of
+from loopwright.service.offline.csv_record.numbers import BAD_STATES, numbers
 
 _NAME = re.compile(r"^(?:(?P<of>.+)[.:/_\s-]+)?(?:quality|quality ?code|status)$|^(?P<tag>.+)[.:/_\s-]+q$")
 """Names of such columns; Q alone may be a flow of heat."""
-_BAD = re.compile(r"^(?:bad|invalid|not good|no data|i/o timeout|comm fail)(?![a-z])", re.IGNORECASE)
+_BAD = re.compile(r"^(?:bad|invalid|not good)(?![a-z])")
 _GOOD_CODE, _BAD_BELOW, _MAX_CODE = 128, 64, 255
 """Codes of OPC and of PROFIBUS: from 128 on the value is good, from 64 on uncertain, below it is bad."""
 
@@ -47,7 +48,7 @@ def bad_values(
             bad[quantity] |= marked
         if belongs and (count := int(np.count_nonzero(marked))):
             whose = " and ".join(names[measured[quantity]].strip() for quantity in belongs)
-            lines = "1 line marks" if count == 1 else f"{count} lines mark"
+            lines = number_of(count, "line marks", "lines mark")
             notes.append(f"{lines} {whose} as bad ({names[column].strip()}): no value was taken from there.")
     return bad, notes
 
@@ -57,4 +58,5 @@ def _marked(cells: Sequence[str]) -> NDArray[np.bool_]:
     codes, wrong = numbers(cells, ".")
     if not wrong and _GOOD_CODE <= float(np.max(np.nan_to_num(codes))) <= _MAX_CODE:
         return np.asarray(codes < _BAD_BELOW)
-    return np.array([_BAD.match(cell) is not None for cell in cells])
+    words = [cell.lower() for cell in cells]
+    return np.array([word in BAD_STATES or _BAD.match(word) is not None for word in words])

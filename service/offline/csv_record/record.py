@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from loopwright.service.offline.csv_record.decimal_signs import decimal_signs, shown_signs
-from loopwright.service.offline.csv_record.errors import RecordError, Unusable, counted
+from loopwright.service.offline.csv_record.errors import RecordError, Unusable, counted, number_of
 from loopwright.service.offline.csv_record.numbers import numbers
 from loopwright.service.offline.csv_record.qualities import bad_values
 from loopwright.service.offline.csv_record.sampling import sampled
@@ -134,15 +134,14 @@ def _no_numbers(name: str, cells: list[str], lines: list[int], wrong: list[int])
 
 
 def _held(name: str, cells: list[str], values: Reals, lines: Sequence[int]) -> list[str]:
-    """A note on the words in place of values of what holds between its values; an empty cell is no new value."""
+    """A note on the words in place of values of MV or SP, which hold their value meanwhile; empty cells are usual."""
     words = [i for i, cell in enumerate(cells) if cell.strip() and np.isnan(values[i])]
     if not words:
         return []
-    count = f"{len(words)} lines have" if len(words) > 1 else "1 line has"
     given = cells[words[0]].strip()
     return [
-        f"{count} no value of {name}, such as {given!r} in line {lines[words[0]]}: the value before was held there, "
-        "whatever it was in truth."
+        f"{number_of(len(words), 'line has', 'lines have')} no value of {name}, such as {given!r} in line "
+        f"{lines[words[0]]}: the value before was held there, whatever it was in truth."
     ]
 
 

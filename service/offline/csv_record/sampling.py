@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.service.offline.csv_record.errors import Unusable, counted
+from loopwright.service.offline.csv_record.errors import Unusable, counted, number_of
 from loopwright.tuning.identification.record import GAP, UNEVEN
 from loopwright.tuning.models import Reals
 
@@ -95,7 +95,7 @@ def _without_repeated(t: Reals, values: Mapping[str, Reals], lines: Whole, notes
             why = ""
         raise Unusable(counted(wrong, "the time does not increase", "times do not increase") + why)
     if repeated:
-        lines_left_out = _count(len(repeated), "line that repeats", "lines that repeat")
+        lines_left_out = number_of(len(repeated), "line that repeats", "lines that repeat")
         notes.append(f"{lines_left_out} the one before {_were(len(repeated))} left out.")
     return [i for i in range(len(t)) if i not in repeated]
 
@@ -122,8 +122,8 @@ def _rows_filled_in(t: Reals, values: Mapping[str, Reals], lines: Whole) -> tupl
         summer_time = len(gaps) == 1 and _is_hour(float(steps[worst]), _HOUR, usual)
         raise Unusable(
             f"line {lines[worst + 1]}: {steps[worst]:.4g} s after the sample before, where {usual:.4g} s is usual "
-            f"({_count(len(gaps), 'such gap', 'such gaps')}). At most {MAX_GAP} missing samples in a row are filled: "
-            "use a part of the file without gaps, or --resample where the historian stores changes alone"
+            f"({number_of(len(gaps), 'such gap', 'such gaps')}). At most {MAX_GAP} missing samples in a row are "
+            "filled: use a part of the file without gaps, or --resample where the historian stores changes alone"
             + (f". If it is the hour that the clock leaves out as summer time begins, {_IN_UTC}" if summer_time else "")
         )
     uneven = np.flatnonzero(np.abs(steps - many * usual) > UNEVEN * usual)
@@ -153,7 +153,7 @@ def _filled(t: Reals, values: Mapping[str, Reals], notes: list[str]) -> EvenSamp
     first, last = int(there[0]), int(there[-1]) + 1
     values = _without_sparse_setpoint({name: column[first:last] for name, column in values.items()}, notes)
     if cut := len(t) - (last - first):
-        notes.append(f"{_count(cut, 'sample', 'samples')} without values at the ends {_were(cut)} left out.")
+        notes.append(f"{number_of(cut, 'sample', 'samples')} without values at the ends {_were(cut)} left out.")
     t, missing = t[first:last], np.any([np.isnan(column) for column in values.values()], axis=0)
     columns = {name: column.copy() for name, column in values.items()}
     filled = int(np.count_nonzero(missing))
@@ -173,8 +173,8 @@ def _filled(t: Reals, values: Mapping[str, Reals], notes: list[str]) -> EvenSamp
     for name, column in columns.items():
         columns[name] = _interpolated(t, t, column, held=name in _HELD)
     notes.append(
-        f"{_count(filled, 'sample', 'samples')} without a value, at most {longest} in a row, {_were(filled)} filled: "
-        "MV and set-point held, PV in a straight line."
+        f"{number_of(filled, 'sample', 'samples')} without a value, at most {longest} in a row, {_were(filled)} "
+        "filled: MV and set-point held, PV in a straight line."
     )
     return EvenSamples(t, columns, tuple(notes))
 
@@ -275,10 +275,6 @@ def _longest_run(missing: NDArray[np.bool_]) -> tuple[int, int]:
 
 def _round(value: float) -> float:
     return float(f"{value:.2g}")
-
-
-def _count(count: int, one: str, many: str) -> str:
-    return f"{count} {one if count == 1 else many}"
 
 
 def _were(count: int) -> str:

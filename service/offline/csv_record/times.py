@@ -170,8 +170,13 @@ def _days(dates: set[tuple[str, str, str, str]], order: str) -> dict[tuple[str, 
     epoch, found = datetime(1970, 1, 1), {}
     for date in dates:
         first, second, third, sign = date
-        whole_year, short_years = len(first) == 4, len(first) == len(third) == 2
-        if (order == "month" and sign == ".") or (not (whole_year or short_years) if order == "year" else whole_year):
+        year_first = len(first) == 4
+        fits = {
+            "day": not year_first,
+            "month": not year_first and sign != ".",
+            "year": year_first or len(first) == len(third) == 2,
+        }
+        if not fits[order]:
             return None
         try:
             month = _MONTHS.get(second[:3].lower())

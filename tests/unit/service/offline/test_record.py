@@ -451,6 +451,7 @@ def test_resampling_ends_with_the_last_value_of_pv() -> None:
         ("t,u,u_q,y,y_q", "{k},1,192,{y},{q}", ("192", "24"), {"y"}),
         ("t,u,TIC 1.PV (degC),TIC 1.PV Status", "{k},1,{y},{q}", ("OK", "Bad: sensor failure"), {"y"}),
         ("t,u,Quality,y,Quality", "{k},1,Good,{y},{q}", ("Good", "BAD"), {"y"}),
+        ("t,u,y,y status", "{k},1,{y},{q}", ("", "Scan Off"), {"y"}),
         ("t,y,u,Status", "{k},{y},1,{q}", ("1", "0"), set()),  # of no known meaning
         ("t,u,y,q", "{k},1,{y},{q}", ("150.5", "3.2"), set()),  # a flow of heat
     ],
