@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from sqlalchemy import delete
 from loopwright.service.api.app import create_app
 from loopwright.service.inputs.config import parse_site
 from loopwright.service.inputs.request import FastRetune
+from loopwright.service.live.jobs import LookedUpJobs
 from loopwright.service.live.messages import RETRY_MS
 from loopwright.service.store.tables import LoopRow
 from loopwright.tuning.reasons import Failed, Reason
@@ -78,6 +79,27 @@ class TestWhatOthersDo:
         site.service.jobs.locking.lock(TAG, "valve is being overhauled", "night shift")
         expect(page.get_by_text("Locked by night shift since")).to_be_visible()
         expect(accept).not_to_be_attached()
+        site.service.jobs.locking.unlock(TAG, "night shift")
+        expect(accept).to_be_enabled()
+
+    def test_the_end_of_a_lock_is_seen_also_where_the_stream_never_said_that_there_was_one(
+        self, site: SimulatedSite, pages: Pages, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The stream looks once a second; the page asked for the loops just between lock and unlock."""
+        look = LookedUpJobs.look
+
+        def without_locks(found: LookedUpJobs, watched: Collection[str], thoroughly: bool) -> None:
+            look(found, watched, thoroughly)
+            found.locked = {}
+
+        monkeypatch.setattr(LookedUpJobs, "look", without_locks)
+        proposal(site.service)
+        page = pages.open(LOOP)
+        accept = page.get_by_role("button", name="Accept the new gains")
+        expect(accept).to_be_enabled()
+        site.service.jobs.locking.lock(TAG, "valve is being overhauled", "night shift")
+        proposal(site.service, OTHER)  # for which the page asks for the loops
+        expect(page.get_by_text("Locked by night shift since")).to_be_visible()
         site.service.jobs.locking.unlock(TAG, "night shift")
         expect(accept).to_be_enabled()
 

@@ -4,7 +4,7 @@ import { batch } from "../vendor/signals-core.js";
 import { forgetHeard } from "./aborting.js";
 import { ask, crowded, signedOut } from "./api.js";
 import {
-  alarms, buses, forgetRows, jobs, newerVersion, now_s, clock_s, refreshLoops, service, setClock, silent_s, takeRows,
+  alarms, buses, forgetRows, jobs, loops, newerVersion, now_s, clock_s, refreshLoops, service, setClock, silent_s, takeRows,
 } from "./state.js";
 import { Windows } from "./windows.js";
 
@@ -15,6 +15,12 @@ const HIDDEN_S = 60;
 const LONGEST_WAIT_S = 15;
 
 /** @typedef {{samples?: (found: any) => void, job?: (found: any) => void}} Listener */
+
+/** Whether the page shows another lock than the stream says: one that came and went between two looks of the service is in no row. @param {any} row */
+function locksDiffer(row) {
+  const shown = loops.value?.get(row.tag);
+  return shown !== undefined && (shown.locked?.since ?? null) !== (row.locked_since ?? null);
+}
 
 class Stream {
   constructor() {
@@ -102,8 +108,8 @@ class Stream {
     on("loops", (found) => {
       setClock(found.now_s);
       takeRows(found.loops);
-      const seen = found.loops.map((/** @type {any} */ row) => `${row.tag}${row.job}${row.last_job?.url}${row.last_job?.state}${row.locked_since}`).join();
-      if (seen !== this.jobs_seen) {
+      const seen = found.loops.map((/** @type {any} */ row) => `${row.tag}${row.job}${row.last_job?.url}${row.last_job?.state}`).join();
+      if (seen !== this.jobs_seen || found.loops.some(locksDiffer)) {
         this.jobs_seen = seen;
         void refreshLoops();
       }
