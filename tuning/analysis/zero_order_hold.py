@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from loopwright.tuning.analysis.exponential import exponentials
@@ -45,20 +46,16 @@ class Pulses:
 
         u: shape (N,), or (records, N) for several records, each with a start of its own.
         """
-        forward = np.swapaxes(self.forward[:, :, :count], 1, 2)
+        forward = np.ascontiguousarray(self.forward[:, :0:-1, :count])  # a held input never acts at its own sample
         forward = forward.reshape(len(forward), *(1,) * (u.ndim - 1), *forward.shape[1:])
-        taps, samples = forward.shape[-1], u.shape[-1]
+        taps, samples = forward.shape[-2], u.shape[-1]
         # one recursion for all states of a plant; what tells them apart is a short sum over its last values
-        common = np.zeros((len(forward), *u.shape[:-1], 1, samples + taps - 2))
-        for row, recursion, delay in zip(common[..., 0, :], self.recursion, self.delay.tolist(), strict=True):
+        common = np.zeros((len(forward), *u.shape[:-1], samples + taps - 1))
+        for row, recursion, delay in zip(common, self.recursion, self.delay.tolist(), strict=True):
             if (length := samples - 1 - delay) > 0:
                 row[..., row.shape[-1] - length :] = recursive(recursion, u[..., :length])
-        # time runs along the last axis until all is summed: numpy is slow along an axis of two or three states
-        driven = common[..., :samples] * forward[..., -1:]
-        tap = np.empty_like(driven)
-        for k in range(1, taps - 1):
-            driven += np.multiply(common[..., k : k + samples], forward[..., -1 - k, None], out=tap)
-        return np.ascontiguousarray(np.swapaxes(driven, -1, -2))
+        windows = as_strided(common, (*common.shape[:-1], samples, taps), (*common.strides, common.strides[-1]))
+        return np.asarray(windows @ forward)
 
 
 def states(monic: Reals, L: float, u: Reals, count: int) -> Reals:
