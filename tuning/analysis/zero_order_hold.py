@@ -41,6 +41,11 @@ class Pulses:
         """The pulse transfer functions of some of the plants."""
         return Pulses(self.forward[which], self.recursion[which], self.delay[which])
 
+    def summed(self, weights: Reals) -> Pulses:
+        """The pulse transfer functions to sums of the first states with these weights in place of the states; shape of
+        weights: (plants, first states, sums)."""
+        return Pulses(self.forward[:, :, : weights.shape[1]] @ weights, self.recursion, self.delay)
+
     def drive(self, u: Reals, count: int | None = None) -> Reals:
         """The first `count` states under u, 0 before the first sample, shape (plants, *u.shape, states).
 

@@ -260,7 +260,9 @@ def rss_by_load_time(fit: Fit[S], structure: Structure, thetas: Reals, shifts: N
     last = np.empty(len(shifts), dtype=np.int64)  # of the samples of the response that count
     for rows in fit.rows:
         mine = (shifts >= rows.start) & (shifts < rows.stop)
-        products[..., mine] = shifted_products(fixed[..., : rows.stop], answers[..., : rows.stop])[..., shifts[mine]]
+        # the response to a load disturbance begins and ends in its piece
+        within_piece = shifted_products(fixed[..., rows], answers[..., : rows.stop - rows.start])
+        products[..., mine] = within_piece[..., shifts[mine] - rows.start]
         last[mine] = rows.stop - shifts[mine] - 1
     along, across = products[:, 0], products[:, 1:]
     gram = np.moveaxis(within[..., last] - np.einsum("pqis,pqjs->pijs", across, across), -1, 1)

@@ -12,7 +12,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.tuning.analysis.zero_order_hold import pulses
+from loopwright.tuning.analysis.zero_order_hold import Pulses, pulses
 from loopwright.tuning.identification.projection import REDUNDANT, Projection
 from loopwright.tuning.identification.regressors import OwnColumns, PieceRows, Regressors
 from loopwright.tuning.identification.structures import Structure
@@ -151,6 +151,7 @@ class Fit(Generic[S]):
         for line, piece in zip(self._ramps, self.pieces, strict=True):
             ramp = averaged(np.linspace(-1.0, 1.0, piece.stop - piece.start), self.block)
             line[: len(ramp)] = ramp
+        self._ramp = self._of_pieces.record(self._ramps[None, :, :, None])[0, :, 0]
         self._rate = math.log(1.0 / self.period)
         self._grids: dict[tuple[Structure, int, float | None, tuple[float, ...], bool], list[Reals]] = {}
 
@@ -191,31 +192,22 @@ class Fit(Generic[S]):
 
     def regressors(self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals) -> Regressors:
         """The regressors of all linear parameters for each theta."""
-        many, inputs, order = len(thetas), structure.zeros + 1, structure.order
-        # one call serves MV and every load disturbance, as call overhead dominates
-        times = thetas[:, structure.lags :].T
-        free = hypothesis.not_at_rest_initially or self.starts_are_free
-        if free:
-            # a step of every state at the start represents any initial state, and a load disturbance
-            times = np.append(times, np.zeros((1, many)), axis=0)
-        loads = len(times) - 1 - free
-        monic = structure.monic(thetas)
-        answers = pulses(np.tile(monic, (len(times), 1)) if len(times) > 1 else monic, times.ravel(), order)
-        driven = answers.of(slice(many))
-        given = [self._of_last_samples(driven.drive(self._driving, inputs))]
+        many, order = len(thetas), structure.order
+        loads, free = hypothesis.load_disturbances, self.start_is_free(hypothesis)
+        driven, stepped = self._plants(structure, hypothesis, thetas)
+        given = [self._of_last_samples(driven.drive(self._driving, structure.zeros + 1))]
         if structure.feed_through:
-            delayed = np.array([_delayed(self._driving, late) for late in driven.delay.tolist()])
-            given.append(self._of_last_samples(delayed[..., None]))
+            given.append(self._fed_through(driven))
         moved = np.empty((0, 0, order))
         if loads or free:
             # a start ends with its piece
             steps = self._step if loads else self._step[: self._longest]
-            moved = averaged(answers.of(slice(many, None)).drive(steps), self.block, 1)
+            moved = averaged(stepped.drive(steps), self.block, 1)
         loaded = [moved[k * many : (k + 1) * many] for k in range(loads)]
         started = moved[loads * many :]
         if self.starts_are_free:
-            for times_of_load, load in zip(times[1 : 1 + loads], loaded, strict=True):
-                self._end_with_piece(load, times_of_load)
+            for k, load in enumerate(loaded):
+                self._end_with_piece(load, thetas[:, structure.lags + 1 + k])
             own = self._own(hypothesis, started[:, : self._of_pieces.longest])
             return Regressors(np.concatenate((*given, *loaded), axis=2), own, self.places(structure, hypothesis))
         first = self.first_load(structure, hypothesis)
@@ -230,6 +222,60 @@ class Fit(Generic[S]):
         for k, columns in enumerate((*loaded, started)[: loads + free]):
             out[:, :, first + order * k : first + order * (k + 1)] = columns
         return Regressors(out)
+
+    def sums(self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals, linear: Reals) -> Reals:
+        """The sums of the regressors for each theta with these linear coefficients, shape (thetas, columns), as shape
+        (thetas, rows): one response of each plant is evaluated instead of all its states."""
+        many, order, loads = len(thetas), structure.order, hypothesis.load_disturbances
+        driven, stepped = self._plants(structure, hypothesis, thetas)
+        of_states = linear[:, : structure.zeros + 1, None]
+        found = self._of_last_samples(driven.summed(of_states).drive(self._driving))[..., 0]
+        if structure.feed_through:
+            found += linear[:, structure.zeros + 1, None] * self._fed_through(driven)[..., 0]
+        level = structure.inputs + self._of_pieces.piece
+        found += linear[:, level]
+        if hypothesis.drift:
+            found += linear[:, level + len(self.pieces)] * self._ramp
+        further = linear[:, self.first_load(structure, hypothesis) :]
+        if loads:
+            of_loads = np.swapaxes(further[:, : loads * order].reshape(many, loads, order), 0, 1)
+            loaded = stepped.of(slice(loads * many)).summed(of_loads.reshape(-1, order, 1))
+            responses = averaged(loaded.drive(self._step), self.block, 1)
+            if self.starts_are_free:
+                self._end_with_piece(responses, thetas[:, structure.lags + 1 :].T.ravel())
+            found += responses.reshape(loads, many, -1).sum(axis=0)
+        if self.start_is_free(hypothesis):
+            of_starts = np.swapaxes(further[:, loads * order :].reshape(many, len(self.pieces), order), 1, 2)
+            started = stepped.of(slice(loads * many, None)).summed(of_starts)
+            responses = averaged(started.drive(self._step[: self._longest]), self.block, 1)
+            found += self._of_pieces.record(np.swapaxes(responses, 1, 2)[..., None])[..., 0]
+        return np.asarray(found)
+
+    def start_is_free(self, hypothesis: DisturbanceHypothesis) -> bool:
+        """Whether each piece begins in a state of its own under this disturbance hypothesis."""
+        return hypothesis.not_at_rest_initially or self.starts_are_free
+
+    def _plants(
+        self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals
+    ) -> tuple[Pulses, Pulses]:
+        """The pulse transfer functions from MV for each theta, and those from each load disturbance and from the
+        start.
+
+        A step at the start of a piece, to every state, represents any initial state and a load disturbance.
+        """
+        times = thetas[:, structure.lags :].T
+        if self.start_is_free(hypothesis):
+            times = np.append(times, np.zeros((1, len(thetas))), axis=0)
+        monic = structure.monic(thetas)
+        # one call serves MV and every load disturbance, as call overhead dominates
+        monics = np.tile(monic, (len(times), 1)) if len(times) > 1 else monic
+        found = pulses(monics, times.ravel(), structure.order)
+        return found.of(slice(len(thetas))), found.of(slice(len(thetas), None))
+
+    def _fed_through(self, driven: Pulses) -> Reals:
+        """MV with the dead time of each plant, averaged, shape (plants, rows, 1)."""
+        delayed = np.array([_delayed(self._driving, late) for late in driven.delay.tolist()])
+        return self._of_last_samples(delayed[..., None])
 
     def _own(self, hypothesis: DisturbanceHypothesis, started: Reals) -> Reals:
         """The level, the slope where PV drifts, and the start of each of several pieces, as `Regressors.own`."""
@@ -309,8 +355,11 @@ class Fit(Generic[S]):
         def regressors(thetas: Reals) -> Regressors:
             return self.regressors(structure, hypothesis, thetas)
 
+        def sums(thetas: Reals, linear: Reals) -> Reals:
+            return self.sums(structure, hypothesis, thetas, linear)
+
         bounded = SearchBounds(low, high, max_step, step)
-        found, rss = descend(regressors, self.y, np.array(starts), bounded, max_steps, RELATIVE_DECREASE)
+        found, rss = descend(regressors, self.y, np.array(starts), bounded, max_steps, RELATIVE_DECREASE, sums)
         return [found[i] for i in np.argsort(rss, kind="stable")]
 
     def bounds(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> tuple[Reals, Reals]:

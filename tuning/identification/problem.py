@@ -133,8 +133,11 @@ class IdentificationProblem:
         def regressors(thetas: Reals) -> Regressors:
             return self.full_fit.regressors(structure, hypothesis, thetas)
 
+        def sums(thetas: Reals, linear: Reals) -> Reals:
+            return self.full_fit.sums(structure, hypothesis, thetas, linear)
+
         bounded = SearchBounds(low, high, max_step, step)
-        found, rss = descend(regressors, self.y, np.array(begun), bounded, MAX_STEPS, RELATIVE_DECREASE)
+        found, rss = descend(regressors, self.y, np.array(begun), bounded, MAX_STEPS, RELATIVE_DECREASE, sums)
         return self.fitted(structure, hypothesis, found[np.argmin(rss)])
 
     def fitted(self, structure: Structure, hypothesis: DisturbanceHypothesis, theta: Reals) -> Fitted:

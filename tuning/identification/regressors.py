@@ -23,12 +23,14 @@ class PieceRows:
     end.
 
     lengths: the number of rows of each piece.
+    piece: the piece of each row, shape (N,).
     inside: which places of the table are rows of the record, shape (pieces, longest).
     """
 
     def __init__(self, lengths: Sequence[int]) -> None:
         self.lengths = tuple(lengths)
         self.longest = max(lengths)
+        self.piece: Rows = np.repeat(np.arange(len(lengths)), lengths)
         self.inside: Flags = np.arange(self.longest) < np.array(lengths)[:, None]
         self._full = bool(self.inside.all())
 

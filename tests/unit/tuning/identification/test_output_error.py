@@ -1,0 +1,57 @@
+"""The sums of the regressors with given coefficients, against the regressors themselves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from loopwright.tuning.identification.output_error import DisturbanceHypothesis, Fit
+from loopwright.tuning.identification.structures import FIRST, SECOND_WITH_FEED_THROUGH, THIRD_WITH_ZERO, Structure
+from loopwright.tuning.models import Reals
+from tests.unit.tuning.recordings import moves
+
+HYPOTHESES = [
+    DisturbanceHypothesis(),
+    DisturbanceHypothesis(load_disturbances=2),
+    DisturbanceHypothesis(drift=True),
+    DisturbanceHypothesis(not_at_rest_initially=True),
+    DisturbanceHypothesis(load_disturbances=1, drift=True, not_at_rest_initially=True),
+]
+
+
+@dataclass(frozen=True)
+class Record:
+    """A record of samples of 1 s in its own units."""
+
+    u: Reals
+    y: Reals
+    block: int
+    pieces: tuple[int, ...]
+    u_earlier: tuple[Reals, ...]
+    Ts: float = 1.0
+    input_range: float = 2.0
+    output_range: float = 3.0
+    period: float = 60.0
+    max_dead_time: float = 60.0
+
+
+@pytest.mark.parametrize("hypothesis", HYPOTHESES, ids=str)
+@pytest.mark.parametrize("structure", [FIRST, SECOND_WITH_FEED_THROUGH, THIRD_WITH_ZERO], ids=lambda s: s.name)
+@pytest.mark.parametrize("pieces", [(300,), (100, 100, 100), (90, 61, 149)], ids=str)
+@pytest.mark.parametrize("block", [1, 3])
+def test_the_sums_of_the_regressors_are_those_of_all_their_columns(
+    pieces: tuple[int, ...], block: int, structure: Structure, hypothesis: DisturbanceHypothesis
+) -> None:
+    rng = np.random.default_rng(7)
+    u = moves(300)
+    fit = Fit(Record(u, rng.normal(size=300), block, pieces, tuple(rng.normal(size=20) for _ in pieces)))
+    logs = rng.uniform(-4.0, -2.0, (4, structure.lags))
+    # the dead time, then the times of the load disturbances, one of them at the edge of two pieces
+    times = np.column_stack((rng.uniform(0.0, 30.0, 4), np.full(4, 100.0), rng.uniform(150.0, 280.0, 4)))
+    thetas = np.hstack((logs, times[:, : 1 + hypothesis.load_disturbances]))
+    columns = fit.regressors(structure, hypothesis, thetas).dense()
+    linear = rng.normal(size=columns.shape[::2]) / np.abs(columns).max(axis=1)
+    found = fit.sums(structure, hypothesis, thetas, linear)
+    assert found == pytest.approx((columns @ linear[..., None])[..., 0], rel=1e-9, abs=1e-9)
