@@ -147,11 +147,9 @@ class Fit(Generic[S]):
         self.period = record.period
         self._step = np.ones(len(self.u))
         self._longest = max(piece.stop - piece.start for piece in self.pieces)
-        self._ramps = np.zeros((len(self.pieces), self._of_pieces.longest))
-        for line, piece in zip(self._ramps, self.pieces, strict=True):
-            ramp = averaged(np.linspace(-1.0, 1.0, piece.stop - piece.start), self.block)
-            line[: len(ramp)] = ramp
-        self._ramp = self._of_pieces.record(self._ramps[None, :, :, None])[0, :, 0]
+        self._ramp = np.concatenate(
+            [averaged(np.linspace(-1.0, 1.0, piece.stop - piece.start), self.block) for piece in self.pieces]
+        )
         self._rate = math.log(1.0 / self.period)
         self._grids: dict[tuple[Structure, int, float | None, tuple[float, ...], bool], list[Reals]] = {}
 
@@ -208,7 +206,7 @@ class Fit(Generic[S]):
         if self.starts_are_free:
             for k, load in enumerate(loaded):
                 self._end_with_piece(load, thetas[:, structure.lags + 1 + k])
-            own = self._own(hypothesis, started[:, : self._of_pieces.longest])
+            own = self._own(hypothesis, started)
             return Regressors(np.concatenate((*given, *loaded), axis=2), own, self.places(structure, hypothesis))
         first = self.first_load(structure, hypothesis)
         out = np.empty((many, self.samples, first + order * (loads + free)))
@@ -218,7 +216,7 @@ class Fit(Generic[S]):
             at += columns.shape[2]
         out[:, :, at] = 1.0
         if hypothesis.drift:
-            out[:, :, at + 1] = self._ramps[0]
+            out[:, :, at + 1] = self._ramp
         for k, columns in enumerate((*loaded, started)[: loads + free]):
             out[:, :, first + order * k : first + order * (k + 1)] = columns
         return Regressors(out)
@@ -248,7 +246,9 @@ class Fit(Generic[S]):
             of_starts = np.swapaxes(further[:, loads * order :].reshape(many, len(self.pieces), order), 1, 2)
             started = stepped.of(slice(loads * many, None)).summed(of_starts)
             responses = averaged(started.drive(self._step[: self._longest]), self.block, 1)
-            found += self._of_pieces.record(np.swapaxes(responses, 1, 2)[..., None])[..., 0]
+            for equal in self._of_pieces.equal:
+                lines = equal.lines(found[:, :, None])[..., 0]
+                lines += np.swapaxes(responses[:, : equal.length, equal.pieces], 1, 2)
         return np.asarray(found)
 
     def start_is_free(self, hypothesis: DisturbanceHypothesis) -> bool:
@@ -277,16 +277,18 @@ class Fit(Generic[S]):
         delayed = np.array([_delayed(self._driving, late) for late in driven.delay.tolist()])
         return self._of_last_samples(delayed[..., None])
 
-    def _own(self, hypothesis: DisturbanceHypothesis, started: Reals) -> Reals:
+    def _own(self, hypothesis: DisturbanceHypothesis, started: Reals) -> tuple[Reals, ...]:
         """The level, the slope where PV drifts, and the start of each of several pieces, as `Regressors.own`."""
-        inside = self._of_pieces.inside
-        first = 1 + hypothesis.drift
-        own = np.empty((len(started), *inside.shape, first + started.shape[-1]))
-        own[..., 0] = inside
-        if hypothesis.drift:
-            own[..., 1] = self._ramps
-        np.multiply(started[:, None], inside[:, :, None], out=own[..., first:])
-        return own
+        found = []
+        for equal in self._of_pieces.equal:
+            begun = started[:, : equal.length]
+            own = np.empty((*begun.shape[:2], 1 + hypothesis.drift + begun.shape[2]))
+            own[:, :, 0] = 1.0
+            if hypothesis.drift:
+                own[:, :, 1] = self._ramp[equal.rows.start : equal.rows.start + equal.length]
+            own[:, :, 1 + hypothesis.drift :] = begun
+            found.append(own)
+        return tuple(found)
 
     def places(self, structure: Structure, hypothesis: DisturbanceHypothesis) -> OwnColumns:
         """Which of the regressors belong to one of several pieces: its level, its slope where PV drifts, and its
@@ -304,7 +306,7 @@ class Fit(Generic[S]):
         lines: shape (plants, pieces, samples, signals). Returned: shape (plants, rows, signals).
         """
         last = averaged(lines[:, :, lines.shape[2] - self._longest :], self.block, 2)
-        return self._of_pieces.record_of_ends(last)
+        return self._of_pieces.of_ends(last)
 
     def _end_with_piece(self, responses: Reals, times: Reals) -> None:
         """Ends the responses to load disturbances, shape (plants, rows, states), with the piece that each begins in."""
@@ -422,7 +424,7 @@ class Fit(Generic[S]):
 
     def _sums_of_squares_left(self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals) -> Reals:
         regressors = self.regressors(structure, hypothesis, thetas)
-        if regressors.own is not None:
+        if regressors.places is not None:
             return Projection.of(regressors, self.y).rss
         return sums_of_squares_left(regressors.common, self.y)
 

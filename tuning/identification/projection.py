@@ -1,7 +1,7 @@
 """The best linear fit of one output by many sets of regressors, and what is left of a signal beyond a set.
 
-The bases of the regressors that belong to one piece of the record are found piece by piece, all pieces at once, and the
-other regressors are made orthogonal to them.
+The bases of the regressors that belong to one piece of the record are found once for all consecutive pieces of one
+length, and the other regressors are made orthogonal to them.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ class Projection:
     """The best linear fit of y by each set of regressors.
 
     regressors: the regressors.
-    own: an orthonormal basis of the regressors of each piece, shape (sets, pieces, longest, directions); None where no
-    regressor belongs to one piece.
+    own: an orthonormal basis of the regressors of each of the equal pieces, shape (sets, length, directions); empty
+    where no regressor belongs to one piece.
     common: an orthonormal basis of the other regressors, orthogonal to those of the pieces, shape (sets, N, others).
     linear: the linear coefficients, shape (sets, columns).
     rest: the residual, shape (sets, N).
     """
 
     regressors: Regressors
-    own: Reals | None
+    own: tuple[Reals, ...]
     common: Reals
     linear: Reals
     rest: Reals
@@ -39,28 +39,30 @@ class Projection:
     @staticmethod
     def of(regressors: Regressors, y: Reals) -> Projection:
         """The projection of y, shape (N,), on each set."""
-        lengths = _lengths(regressors.common)
+        lengths, places = _lengths(regressors.common), regressors.places
         common = regressors.common / lengths[:, None]
-        rest = np.empty((len(common), len(y), 1))
-        rest[:, :, 0] = y
-        if regressors.own is None or regressors.places is None:
+        rest = np.repeat(y[None, :, None], len(common), axis=0)
+        if places is None:
             factors = _Factors.of(common)
-            linear = factors.coefficients(_take_out(factors.basis, rest))[:, :, 0]
-            return Projection(regressors, None, factors.basis, linear / lengths, rest[:, :, 0])
-        places = regressors.places
-        own_lengths = _lengths(regressors.own)
-        own = _Factors.of(regressors.own / own_lengths[:, :, None])
-        signals = places.rows.table(np.concatenate((rest, common), axis=2))
-        # the directions of y and, for each of the other regressors, of that
-        solutions = own.coefficients(_take_out(own.basis, signals))
-        signals = places.rows.record(signals)
-        rest = np.ascontiguousarray(signals[:, :, :1])
+            along = factors.coefficients(_take_out(factors.basis, rest)[:, None])[:, 0, :, 0]
+            return Projection(regressors, (), factors.basis, along / lengths, rest[:, :, 0])
+        signals = np.concatenate((rest, common), axis=2)
+        own, solutions = [], []
+        for equal, columns in zip(places.rows.equal, regressors.own, strict=True):
+            factors = _Factors.of(columns / (own_lengths := _lengths(columns))[:, None])
+            along = _take_out(factors.basis[:, None], equal.lines(signals))
+            own.append(factors.basis)
+            # the directions of y and, for each of the other regressors, of that
+            solutions.append(factors.coefficients(along) / own_lengths[:, None, :, None])
+        rest = signals[:, :, :1].copy()
         factors = _Factors.of(signals[:, :, 1:])
-        found = factors.coefficients(_take_out(factors.basis, rest))
+        found = factors.coefficients(_take_out(factors.basis, rest)[:, None])[:, 0]
         linear = np.empty((len(common), places.common.size + places.own.size))
         linear[:, places.common] = found[:, :, 0] / lengths
-        linear[:, places.own] = (solutions[..., 0] - (solutions[..., 1:] @ found[:, None])[..., 0]) / own_lengths
-        return Projection(regressors, own.basis, factors.basis, linear, rest[:, :, 0])
+        for equal, solution in zip(places.rows.equal, solutions, strict=True):
+            without = solution[..., 0] - (solution[..., 1:] @ found[:, None])[..., 0]
+            linear[:, places.own[equal.pieces]] = without
+        return Projection(regressors, tuple(own), factors.basis, linear, rest[:, :, 0])
 
     @property
     def rss(self) -> Reals:
@@ -72,12 +74,10 @@ class Projection:
 
     def beyond(self, signals: Reals, which: Rows) -> Reals:
         """What is left of the signals, shape (sets, N, signals), beyond the regressors of these sets."""
-        if self.own is None or self.regressors.places is None:
-            left = signals.copy()
-        else:
-            table = self.regressors.places.rows.table(signals)
-            _take_out(self.own[which], table)
-            left = self.regressors.places.rows.record(table)
+        left = signals.copy()
+        if (places := self.regressors.places) is not None:
+            for equal, basis in zip(places.rows.equal, self.own, strict=True):
+                _take_out(basis[which, None], equal.lines(left))
         _take_out(self.common[which], left)
         return left
 
@@ -87,17 +87,16 @@ class Projection:
             mine[where] = other[which]
 
     def _arrays(self) -> Sequence[Reals]:
-        own = [each for each in (self.own, self.regressors.own) if each is not None]
-        return self.regressors.common, *own, self.common, self.linear, self.rest
+        return self.regressors.common, *self.regressors.own, *self.own, self.common, self.linear, self.rest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Factors:
     """Regressors as the product of an orthonormal basis and of square matrices.
 
-    basis: shape (..., N, directions), 0 where a direction is redundant.
-    square: shape (..., directions, directions).
-    seen: whether no direction is redundant, shape (...).
+    basis: shape (sets, N, directions), 0 where a direction is redundant.
+    square: shape (sets, directions, directions).
+    seen: whether no direction is redundant, shape (sets,).
     """
 
     basis: Reals
@@ -106,30 +105,36 @@ class _Factors:
 
     @staticmethod
     def of(columns: Reals) -> _Factors:
-        """columns: regressors of about unit length, shape (..., N, columns)."""
+        """columns: regressors of about unit length, shape (sets, N, columns)."""
+        rows = columns.shape[1]
+        if rows < columns.shape[2]:
+            columns = np.pad(columns, ((0, 0), (0, columns.shape[2] - rows), (0, 0)))
         basis, square = np.linalg.qr(columns)
-        seen = np.abs(np.einsum("...ii->...i", square)).min(axis=-1, initial=np.inf) > REDUNDANT
-        for i in zip(*np.nonzero(~seen), strict=True):
+        seen = np.abs(np.einsum("bii->bi", square)).min(axis=1, initial=np.inf) > REDUNDANT
+        for i in np.flatnonzero(~seen):
             directions, sizes, turned = np.linalg.svd(columns[i], full_matrices=False)
             sizes[sizes <= REDUNDANT] = 0.0
             basis[i], square[i] = directions * (sizes > 0.0), sizes[:, None] * turned
-        return _Factors(basis, square, seen)
+        return _Factors(basis[:, :rows], square, seen)
 
     def coefficients(self, along: Reals) -> Reals:
-        """The coefficients of the columns for these directions, shape (..., directions, signals); the smallest ones
-        where a direction is redundant."""
+        """The coefficients of the columns for these directions, shape (sets, pieces, directions, signals); the smallest
+        ones where a direction is redundant."""
+        sets, pieces, directions, signals = along.shape
+        turned = np.swapaxes(along, 1, 2).reshape(sets, directions, pieces * signals)
         if self.seen.all():
-            return np.asarray(np.linalg.solve(self.square, along))
-        found = np.empty_like(along)
-        found[self.seen] = np.linalg.solve(self.square[self.seen], along[self.seen])
-        for i in zip(*np.nonzero(~self.seen), strict=True):
-            found[i] = np.linalg.lstsq(self.square[i], along[i], rcond=REDUNDANT)[0]
-        return found
+            found = np.linalg.solve(self.square, turned)
+        else:
+            found = np.empty_like(turned)
+            found[self.seen] = np.linalg.solve(self.square[self.seen], turned[self.seen])
+            for i in np.flatnonzero(~self.seen):
+                found[i] = np.linalg.lstsq(self.square[i], turned[i], rcond=REDUNDANT)[0]
+        return np.swapaxes(found.reshape(sets, directions, pieces, signals), 1, 2)
 
 
 def _lengths(columns: Reals) -> Reals:
-    """The lengths of the columns, shape (..., N, columns), 1 where a column is 0."""
-    lengths = np.sqrt(np.einsum("...ij,...ij->...j", columns, columns))
+    """The lengths of the columns, shape (sets, N, columns), 1 where a column is 0."""
+    lengths = np.sqrt(np.einsum("bij,bij->bj", columns, columns))
     lengths[lengths == 0.0] = 1.0
     return np.asarray(lengths)
 

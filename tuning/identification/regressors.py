@@ -1,13 +1,14 @@
 """Many sets of regressors of one record, those that belong to one piece of the record apart from the others.
 
 The level, the slope and the start of a piece are 0 in all other pieces: of a record with a dozen pieces, most of a
-matrix of all regressors would be zeros.
+matrix of all regressors would be zeros. Pieces of one length have the same ones.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,44 +19,50 @@ Rows = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
+@dataclass(frozen=True, slots=True)
+class EqualPieces:
+    """Consecutive pieces of one length.
+
+    pieces: which pieces of the record.
+    rows: their rows.
+    length: the number of rows of each.
+    """
+
+    pieces: slice
+    rows: slice
+    length: int
+
+    def lines(self, signals: Reals) -> Reals:
+        """These pieces of signals, shape (sets, N, signals), as a view of shape (sets, pieces, length, signals)."""
+        count = self.pieces.stop - self.pieces.start
+        return signals[:, self.rows].reshape(len(signals), count, self.length, signals.shape[-1])
+
+
 class PieceRows:
-    """The rows of the pieces of a record, also as a table with one line for each piece, filled up with zeros at its
-    end.
+    """The rows of the pieces of a record.
 
     lengths: the number of rows of each piece.
     piece: the piece of each row, shape (N,).
-    inside: which places of the table are rows of the record, shape (pieces, longest).
+    equal: the pieces, those of one length that follow each other together.
     """
 
     def __init__(self, lengths: Sequence[int]) -> None:
         self.lengths = tuple(lengths)
-        self.longest = max(lengths)
         self.piece: Rows = np.repeat(np.arange(len(lengths)), lengths)
-        self.inside: Flags = np.arange(self.longest) < np.array(lengths)[:, None]
-        self._full = bool(self.inside.all())
+        self.equal: list[EqualPieces] = []
+        piece = row = 0
+        for length, group in groupby(self.lengths):
+            count = len(list(group))
+            self.equal.append(EqualPieces(slice(piece, piece + count), slice(row, row + count * length), length))
+            piece, row = piece + count, row + count * length
 
-    def table(self, signals: Reals) -> Reals:
-        """Signals of shape (sets, N, signals) as tables, shape (sets, pieces, longest, signals), in memory of their
-        own."""
-        sets, _, count = signals.shape
-        shape = (sets, len(self.lengths), self.longest, count)
-        if self._full:
-            return signals.reshape(shape).copy()
-        found = np.zeros(shape)
-        found[:, self.inside] = signals
+    def of_ends(self, lines: Reals) -> Reals:
+        """Lines of shape (sets, pieces, longest, signals), filled up at their beginnings, as signals of the record,
+        shape (sets, N, signals)."""
+        found = np.empty((len(lines), len(self.piece), lines.shape[-1]))
+        for equal in self.equal:
+            equal.lines(found)[...] = lines[:, equal.pieces, lines.shape[2] - equal.length :]
         return found
-
-    def record(self, table: Reals) -> Reals:
-        """Tables of shape (sets, pieces, longest, signals) as signals of the record, shape (sets, N, signals)."""
-        if self._full:
-            return table.reshape(len(table), -1, table.shape[-1])
-        return np.asarray(table[:, self.inside])
-
-    def record_of_ends(self, table: Reals) -> Reals:
-        """As `record`, of a table whose lines are filled up at their beginnings."""
-        if self._full:
-            return self.record(table)
-        return np.asarray(table[:, self.inside[:, ::-1]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,36 +84,38 @@ class Regressors:
     """Sets of regressors.
 
     common: those that belong to no single piece, shape (sets, N, others).
-    own: those of each piece in its rows, 0 beyond its end, shape (sets, pieces, longest, each). None where no regressor
-    belongs to one piece; `places` is then None, too.
+    own: those of each of the equal pieces in its rows, shape (sets, length, each). Empty where no regressor belongs to
+    one piece; `places` is then None.
     places: which ones belong to one piece.
     """
 
     common: Reals
-    own: Reals | None = None
+    own: tuple[Reals, ...] = ()
     places: OwnColumns | None = None
 
     def dense(self) -> Reals:
         """All regressors, shape (sets, N, columns)."""
-        if self.own is None or self.places is None:
+        if self.places is None:
             return self.common
         sets, samples, others = self.common.shape
         found = np.zeros((sets, samples, others + self.places.own.size))
         found[:, :, self.places.common] = self.common
-        begin = 0
-        for piece, length in enumerate(self.places.rows.lengths):
-            found[:, begin : begin + length, self.places.own[piece]] = self.own[:, piece, :length]
-            begin += length
+        for equal, own in zip(self.places.rows.equal, self.own, strict=True):
+            lines = equal.lines(found)
+            for line, columns in enumerate(self.places.own[equal.pieces]):
+                lines[:, line, :, columns] = np.moveaxis(own, -1, 0)
         return found
 
     def times(self, linear: Reals) -> Reals:
         """The sums of the regressors with these coefficients, shape (sets, columns), as shape (sets, N)."""
-        if self.own is None or self.places is None:
+        if self.places is None:
             return np.asarray((self.common @ linear[:, :, None])[:, :, 0])
-        of_pieces = self.own @ linear[:, self.places.own][..., None]
-        common = self.common @ linear[:, self.places.common][..., None]
-        return np.asarray((common + self.places.rows.record(of_pieces))[:, :, 0])
+        found = self.common @ linear[:, self.places.common, None]
+        for equal, own in zip(self.places.rows.equal, self.own, strict=True):
+            lines = equal.lines(found)[..., 0]
+            lines += np.swapaxes(own @ np.swapaxes(linear[:, self.places.own[equal.pieces]], 1, 2), 1, 2)
+        return np.asarray(found[:, :, 0])
 
     def of(self, which: Rows) -> Regressors:
         """Some of the sets."""
-        return Regressors(self.common[which], None if self.own is None else self.own[which], self.places)
+        return Regressors(self.common[which], tuple(own[which] for own in self.own), self.places)

@@ -9,7 +9,12 @@ from loopwright.tuning.identification.projection import Projection
 from loopwright.tuning.identification.regressors import OwnColumns, PieceRows, Regressors
 from loopwright.tuning.models import Reals
 
-LENGTHS = {"of one length": (30, 30, 30), "of several lengths": (30, 45, 15)}
+LENGTHS = {
+    "of one length": (30, 30, 30),
+    "the first longer": (40, 25, 25),
+    "of several lengths": (30, 45, 15),
+    "one length apart": (35, 20, 35),
+}
 SAMPLES, SETS = 90, np.arange(4)
 COMMON = np.array([0, 1, 5])
 OWN = np.array([[2 + i, 6 + 2 * i, 7 + 2 * i] for i in range(3)])
@@ -23,8 +28,7 @@ def places(request: pytest.FixtureRequest) -> OwnColumns:
 
 def regressors(places: OwnColumns, seed: int = 1) -> Regressors:
     random = np.random.default_rng(seed)
-    rows = places.rows
-    own = random.normal(size=(len(SETS), *rows.inside.shape, OWN.shape[1])) * rows.inside[:, :, None]
+    own = tuple(random.normal(size=(len(SETS), equal.length, OWN.shape[1])) for equal in places.rows.equal)
     common = random.normal(size=(len(SETS), SAMPLES, len(COMMON)))
     common[:, :, 0] *= 1e3
     return Regressors(common, own, places)
@@ -36,28 +40,33 @@ def output() -> Reals:
 
 def test_each_regressor_stands_in_its_place_and_in_the_rows_of_its_piece(places: OwnColumns) -> None:
     given = regressors(places)
-    assert given.own is not None
     dense = given.dense()
     assert dense.shape == (len(SETS), SAMPLES, 12)
     assert np.array_equal(dense[:, :, COMMON], given.common)
+    of_piece = [own for equal, own in zip(places.rows.equal, given.own, strict=True) for _ in range(3)[equal.pieces]]
     begin = 0
     for piece, length in enumerate(places.rows.lengths):
         mine = dense[:, :, OWN[piece]]
-        assert np.array_equal(mine[:, begin : begin + length], given.own[:, piece, :length])
+        assert np.array_equal(mine[:, begin : begin + length], of_piece[piece])
         assert not np.any(np.delete(mine, slice(begin, begin + length), axis=1))
         begin += length
 
 
-def test_signals_are_the_same_after_they_were_a_table(places: OwnColumns) -> None:
+def test_pieces_of_one_length_that_follow_each_other_are_one_view_of_the_signals(places: OwnColumns) -> None:
     signals = np.random.default_rng(3).normal(size=(2, SAMPLES, 3))
-    table = places.rows.table(signals)
-    assert np.array_equal(places.rows.record(table), signals)
-    assert not np.any(table[:, ~places.rows.inside])
-    backwards = places.rows.record_of_ends(table[:, :, ::-1])
-    begin = 0
-    for length in places.rows.lengths:
-        assert np.array_equal(backwards[:, begin : begin + length], signals[:, begin : begin + length][:, ::-1])
-        begin += length
+    pieces = [piece for equal in places.rows.equal for piece in np.swapaxes(equal.lines(signals), 0, 1)]
+    begins = np.cumsum((0, *places.rows.lengths))
+    for piece, begin, end in zip(pieces, begins, begins[1:], strict=False):
+        assert np.array_equal(piece, signals[:, begin:end]) and np.shares_memory(piece, signals)
+    assert len(pieces) == 3 and begins[-1] == SAMPLES
+    assert places.rows.piece.tolist() == [i for i, length in enumerate(places.rows.lengths) for _ in range(length)]
+
+
+def test_lines_that_are_filled_up_at_their_beginnings_become_signals(places: OwnColumns) -> None:
+    lengths = places.rows.lengths
+    lines = np.random.default_rng(3).normal(size=(2, 3, max(lengths), 4))
+    expected = np.concatenate([lines[:, i, max(lengths) - length :] for i, length in enumerate(lengths)], axis=1)
+    assert np.array_equal(places.rows.of_ends(lines), expected)
 
 
 def test_coefficients_and_residual_are_those_of_least_squares(places: OwnColumns) -> None:
@@ -85,8 +94,7 @@ def test_what_is_left_of_a_signal_is_that_of_all_regressors_at_once(places: OwnC
 @pytest.mark.parametrize("of_piece", [True, False])
 def test_a_regressor_that_others_make_up_leaves_the_residual(places: OwnColumns, of_piece: bool) -> None:
     given, y = regressors(places), output()
-    assert given.own is not None
-    of_one = given.own[:, 0] if of_piece else given.common
+    of_one = given.own[0] if of_piece else given.common
     without = Projection.of(given, y).rss
     of_one[:, :, 2] = 0.0
     less = Projection.of(given, y)
@@ -94,7 +102,7 @@ def test_a_regressor_that_others_make_up_leaves_the_residual(places: OwnColumns,
     again = Projection.of(given, y)
     columns = given.dense()
     for i in SETS:
-        others = np.delete(columns[i], OWN[0, 2] if of_piece else COMMON[2], axis=1)
+        others = np.delete(columns[i], OWN[places.rows.equal[0].pieces, 2] if of_piece else COMMON[2], axis=1)
         rss = np.linalg.lstsq(others, y, rcond=None)[1]
         assert np.isfinite(again.linear).all() and np.isfinite(less.linear).all()
         assert [again.rss[i], less.rss[i]] == pytest.approx([rss[0]] * 2, rel=1e-9)
