@@ -24,10 +24,13 @@ from loopwright.tuning.reasons import Failed, Reason
 
 LISTEN_S = 2.0
 """Wall time for which heartbeats are heard, s: the devices of the profile send one every 0.5 s."""
-ANSWER_S = 0.3
-"""Wall time for which all answers to one request are awaited, s."""
+ANSWER_S = 2.0
+"""Wall time for which the first answer to a request is awaited, s: a device may be busy, and a request that is sent
+again would be answered twice."""
+FURTHER_S = 0.3
+"""Wall time for which the answers of further devices are awaited after it, s."""
 NODES = range(1, 128)
-_UPLOAD, _ABORT = 0x40, 0x80
+_UPLOAD = 0x40
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +122,9 @@ def _answers(bus: Bus, station: Station, node: int, name: str, sub: int = 0) -> 
     until = station.monotonic() + ANSWER_S
     while (left := until - station.monotonic()) > 0.0:
         frame = bus.recv(left)
-        if frame is None or len(frame[1]) != 8 or frame[1][1:4] != address or frame[1][0] == _ABORT:
+        if frame is None or len(frame[1]) != 8 or frame[1][1:4] != address:
             continue
+        until = min(until, station.monotonic() + FURTHER_S)
         if frame[1][0] & 0x02:  # expedited: the value is in this frame
             length = 4 - (frame[1][0] >> 2 & 3) if frame[1][0] & 0x01 else 4
             found.append(int.from_bytes(frame[1][4 : 4 + length], "little"))

@@ -21,7 +21,6 @@ class Signals:
 
     def __init__(self) -> None:
         self._asked = False
-        self._end: Callable[[], None] = lambda: None
         # A signal may interrupt any code: logging uses locks, this queue uses none.
         self._heard: SimpleQueue[int | None] = SimpleQueue()
         self._reporter: threading.Thread | None = None
@@ -40,30 +39,33 @@ class Signals:
             signal.signal(each, _leave if self._asked else handler)
 
     def tell(self, end: Callable[[], None], awaited: Callable[[], str]) -> None:
-        """Calls `end` when a signal comes, or has come already.
+        """Calls `end` when a signal comes, from a thread; at once where one has come already.
 
-        awaited: returns what the end of the service waits for, in words.
+        end: may be called several times.
+        awaited: returns what the end of the service waits for, in words. It is asked before `end` is called: what was
+        under test when the signal came may be restored a moment later.
         """
-        self._end = end
-        self._reporter = threading.Thread(target=self._report, args=(awaited,), name="signals", daemon=True)
-        self._reporter.start()
         if self._asked:
             end()
+        self._reporter = threading.Thread(target=self._report, args=(end, awaited), name="signals", daemon=True)
+        self._reporter.start()
 
     def _hear(self, number: int, _frame: FrameType | None) -> None:
+        self._asked = True
         self._heard.put(number)
-        if not self._asked:
-            self._asked = True
-            self._end()
 
-    def _report(self, awaited: Callable[[], str]) -> None:
+    def _report(self, end: Callable[[], None], awaited: Callable[[], str]) -> None:
         first = True
         while (number := self._heard.get()) is not None:
             name = signal.Signals(number).name
+            try:
+                words = awaited()
+            finally:
+                end()
             if first:
-                _log.info("%s: the service ends; %s", name, awaited())
+                _log.info("%s: the service ends; %s", name, words)
             else:
-                _log.warning("%s again: the service is ending, and is not cut short; %s", name, awaited())
+                _log.warning("%s again: the service is ending, and is not cut short; %s", name, words)
             first = False
 
 

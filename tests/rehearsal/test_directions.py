@@ -106,7 +106,7 @@ def test_a_gain_that_differs_below_is_refused_where_MV_goes_there(below: float, 
     assert of_two_sided(below, directions).value is None
 
 
-@pytest.mark.parametrize("seed", [2, 6])
+@pytest.mark.parametrize("seed", [2, 16])
 def test_where_MV_hardly_goes_there_the_gains_hold_for_the_side_that_was_tested(seed: int) -> None:
     """Under other noise the difference shows and is refused. With these seeds it does not, whatever is rounded."""
     found = of_two_sided(0.7, Directions.UP, 0.25, 12.0, seed).value

@@ -28,6 +28,21 @@ def test_both_devices_are_found_and_nothing_is_written(site: Site) -> None:
     assert site.names() == []
 
 
+def test_a_device_that_is_busy_for_a_second_is_waited_for(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    pump, ran = site.pump, [0.0]
+
+    def now_and_then() -> None:
+        if site.wire.clock.now >= ran[-1] + 1.0:
+            ran.append(site.wire.clock.now)
+            pump()
+
+    monkeypatch.setattr(site, "pump", now_and_then)
+    plant, controller = probe("wire", site.gateway)
+    assert controller == FoundNode(CONTROLLER_NODE, "operational", Device.CONTROLLER, 3, 0.1)
+    assert plant == FoundNode(PLANT_NODE, "operational", Device.PLANT, 3, 0.1)
+    assert len(ran) > 8, "they had to be waited for"
+
+
 def test_a_node_without_sdo_and_one_that_is_asked_for(site: Site) -> None:
     others = site.wire.open()
     site.gateway.before = lambda call: others.send(heartbeat_id(0x7D), HEARTBEAT_FRAME.pack(NmtState.OPERATIONAL))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import signal
 import socket
 import sqlite3
@@ -165,6 +167,19 @@ def test_a_signal_after_everything_has_ended_ends_a_process_that_hangs(tmp_path:
         assert process.stdout is not None and process.stdout.readline() == "hangs\n"
         process.send_signal(signal.SIGINT)
         assert process.wait(120) == 0
+
+
+def test_the_log_says_what_was_awaited_when_the_signal_came(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    under_test, before = [TAG], {each: signal.getsignal(each) for each in SIGNALS}
+    try:
+        with Signals() as signals:
+            signals.tell(under_test.clear, lambda: f"it waits for {under_test}")
+            os.kill(os.getpid(), signal.SIGTERM)
+    finally:
+        for each in SIGNALS:
+            signal.signal(each, before[each])
+    assert caplog.messages == [f"SIGTERM: the service ends; it waits for ['{TAG}']"] and not under_test
 
 
 def test_signals_that_nobody_sent_are_the_callers_again() -> None:
