@@ -28,9 +28,9 @@ ANSWER_S = 2.0
 """Wall time for which the first answer to a request is awaited, s: a device may be busy, and a request that is sent
 again would be answered twice."""
 FURTHER_S = 0.3
-"""Wall time for which the answers of further devices are awaited after it, s."""
+"""Wall time for which the answers of further devices with the same node-ID are awaited after it, s."""
 NODES = range(1, 128)
-_UPLOAD = 0x40
+_UPLOAD, _ABORT, _SPECIFIER = 0x40, 0x80, 0xE0
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,14 +118,17 @@ def _answers(bus: Bus, station: Station, node: int, name: str, sub: int = 0) -> 
     """Returns the value of an object as each device with this node-ID answers it: whole numbers of up to four bytes."""
     address = struct.pack("<HB", lookup(name).index, sub)
     bus.send(sdo_request_id(node), bytes([_UPLOAD]) + address + bytes(4))
-    found = []
+    found, answered = [], False
     until = station.monotonic() + ANSWER_S
     while (left := until - station.monotonic()) > 0.0:
         frame = bus.recv(left)
         if frame is None or len(frame[1]) != 8 or frame[1][1:4] != address:
             continue
-        until = min(until, station.monotonic() + FURTHER_S)
-        if frame[1][0] & 0x02:  # expedited: the value is in this frame
+        if frame[1][0] & _SPECIFIER not in (_UPLOAD, _ABORT):  # it answers what somebody else has asked
+            continue
+        if not answered:
+            answered, until = True, station.monotonic() + FURTHER_S
+        if frame[1][0] & _SPECIFIER == _UPLOAD and frame[1][0] & 0x02:  # expedited: the value is in this frame
             length = 4 - (frame[1][0] >> 2 & 3) if frame[1][0] & 0x01 else 4
             found.append(int.from_bytes(frame[1][4 : 4 + length], "little"))
     return found

@@ -117,7 +117,7 @@ def tell_systemd(state: str) -> None:
     """Reports a state to systemd by sd_notify, for a unit of Type=notify; does nothing without one."""
     address = os.environ.get("NOTIFY_SOCKET")
     if address:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, suppress(OSError):
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
             notify.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
 
 
@@ -280,10 +280,10 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
 
         def end() -> None:
             """Ends jobs and server: the server waits for its connections, and event streams end with their jobs."""
-            tell_systemd("STOPPING=1")
             jobs.request_stop()
             figures.request_stop()  # else the server would cancel requests that wait for them, and log each as an error
             server.should_exit = True
+            tell_systemd("STOPPING=1")
 
         signals.tell(end, partial(_awaited, jobs))
         load()

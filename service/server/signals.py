@@ -39,11 +39,11 @@ class Signals:
             signal.signal(each, _leave if self._asked else handler)
 
     def tell(self, end: Callable[[], None], awaited: Callable[[], str]) -> None:
-        """Calls `end` when a signal comes, from a thread; at once where one has come already.
+        """Has `end` called by a thread of its own at each signal; where one has come already, before this returns.
 
         end: may be called several times.
-        awaited: returns what the end of the service waits for, in words. It is asked before `end` is called: what was
-        under test when the signal came may be restored a moment later.
+        awaited: returns what the end of the service waits for, in words, at once. A signal that comes later has it
+        called before `end`: what was under test when the signal came may be restored a moment later.
         """
         if self._asked:
             end()
@@ -58,10 +58,16 @@ class Signals:
         first = True
         while (number := self._heard.get()) is not None:
             name = signal.Signals(number).name
+            words = "what it waits for is not known"
             try:
                 words = awaited()
-            finally:
+            except Exception:
+                _log.exception("%s: what the end of the service waits for could not be found out", name)
+            try:
                 end()
+            except Exception:
+                _log.exception("%s: the end of the service could not be begun; a further signal tries again", name)
+                continue
             if first:
                 _log.info("%s: the service ends; %s", name, words)
             else:

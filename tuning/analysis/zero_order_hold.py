@@ -42,8 +42,10 @@ class Pulses:
         return Pulses(self.forward[which], self.recursion[which], self.delay[which])
 
     def summed(self, weights: Reals) -> Pulses:
-        """The pulse transfer functions to sums of the first states with these weights in place of the states; shape of
-        weights: (plants, first states, sums)."""
+        """The pulse transfer functions to weighted sums of the first states.
+
+        weights: shape (plants, first states, sums).
+        """
         return Pulses(self.forward[:, :, : weights.shape[1]] @ weights, self.recursion, self.delay)
 
     def drive(self, u: Reals, count: int | None = None) -> Reals:
@@ -59,7 +61,9 @@ class Pulses:
         for row, recursion, delay in zip(common, self.recursion, self.delay.tolist(), strict=True):
             if (length := samples - 1 - delay) > 0:
                 row[..., row.shape[-1] - length :] = recursive(recursion, u[..., :length])
-        windows = as_strided(common, (*common.shape[:-1], samples, taps), (*common.strides, common.strides[-1]))
+        # row n is common[n : n + taps], without a copy
+        strides = (*common.strides, common.strides[-1])
+        windows = as_strided(common, (*common.shape[:-1], samples, taps), strides, writeable=False)
         return np.asarray(windows @ forward)
 
 

@@ -22,6 +22,8 @@ from loopwright.tuning.identification.output_error import (
     RecordToFit,
     averaged,
 )
+from loopwright.tuning.identification.projection import Projection
+from loopwright.tuning.identification.regressors import Regressors
 from loopwright.tuning.identification.shifts import SAMPLES_TOGETHER, products_within, shifted_products
 from loopwright.tuning.identification.structures import (
     FIRST,
@@ -251,15 +253,16 @@ def rss_by_load_time(fit: Fit[S], structure: Structure, thetas: Reals, shifts: N
     """
     order = structure.order
     columns = fit.regressors(structure, DisturbanceHypothesis(thetas.shape[1] - structure.searched), thetas).dense()
-    base = np.linalg.qr(columns)[0]
-    basis = np.swapaxes(base, 1, 2)
-    rest = fit.y - (base @ (basis @ fit.y)[:, :, None])[:, :, 0]
+    without = Projection.of(Regressors(columns), fit.y)
+    basis, rest = np.swapaxes(without.common, 1, 2), without.rest
     answers = np.swapaxes(answers_to_load(structure, thetas, len(fit.u), fit.block), 1, 2)
     fixed, within = np.concatenate((rest[:, None], basis), axis=1), products_within(answers)
     products = np.empty((*fixed.shape[:2], order, len(shifts)))
     last = np.empty(len(shifts), dtype=np.int64)  # of the samples of the response that count
     for rows in fit.rows:
         mine = (shifts >= rows.start) & (shifts < rows.stop)
+        if not mine.any():
+            continue
         # the response to a load disturbance begins and ends in its piece
         within_piece = shifted_products(fixed[..., rows], answers[..., : rows.stop - rows.start])
         products[..., mine] = within_piece[..., shifts[mine] - rows.start]

@@ -189,7 +189,8 @@ class Fit(Generic[S]):
         return structure.inputs + len(self.pieces) * (1 + hypothesis.drift)
 
     def regressors(self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals) -> Regressors:
-        """The regressors of all linear parameters for each theta."""
+        """The regressors of all linear parameters for each theta, which has a time for each load disturbance of the
+        hypothesis."""
         many, order = len(thetas), structure.order
         loads, free = hypothesis.load_disturbances, self.start_is_free(hypothesis)
         driven, stepped = self._plants(structure, hypothesis, thetas)
@@ -241,7 +242,7 @@ class Fit(Generic[S]):
             responses = averaged(loaded.drive(self._step), self.block, 1)
             if self.starts_are_free:
                 self._end_with_piece(responses, thetas[:, structure.lags + 1 :].T.ravel())
-            found += responses.reshape(loads, many, -1).sum(axis=0)
+            found += responses.reshape(loads, many, self.samples).sum(axis=0)
         if self.start_is_free(hypothesis):
             of_starts = np.swapaxes(further[:, loads * order :].reshape(many, len(self.pieces), order), 1, 2)
             started = stepped.of(slice(loads * many, None)).summed(of_starts)

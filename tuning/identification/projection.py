@@ -23,7 +23,7 @@ class Projection:
     """The best linear fit of y by each set of regressors.
 
     regressors: the regressors.
-    own: an orthonormal basis of the regressors of each of the equal pieces, shape (sets, length, directions); empty
+    own: an orthonormal basis of the regressors of each group of equal pieces, shape (sets, length, directions); empty
     where no regressor belongs to one piece.
     common: an orthonormal basis of the other regressors, orthogonal to those of the pieces, shape (sets, N, others).
     linear: the linear coefficients, shape (sets, columns).
@@ -52,7 +52,7 @@ class Projection:
             factors = _Factors.of(columns / (own_lengths := _lengths(columns))[:, None])
             along = _take_out(factors.basis[:, None], equal.lines(signals))
             own.append(factors.basis)
-            # the directions of y and, for each of the other regressors, of that
+            # these are the coefficients for y and for each of the other regressors
             solutions.append(factors.coefficients(along) / own_lengths[:, None, :, None])
         rest = signals[:, :, :1].copy()
         factors = _Factors.of(signals[:, :, 1:])
@@ -107,6 +107,7 @@ class _Factors:
     def of(columns: Reals) -> _Factors:
         """columns: regressors of about unit length, shape (sets, N, columns)."""
         rows = columns.shape[1]
+        # a piece may have fewer rows than regressors: rows of zeros make the factor square
         if rows < columns.shape[2]:
             columns = np.pad(columns, ((0, 0), (0, columns.shape[2] - rows), (0, 0)))
         basis, square = np.linalg.qr(columns)
@@ -118,8 +119,10 @@ class _Factors:
         return _Factors(basis[:, :rows], square, seen)
 
     def coefficients(self, along: Reals) -> Reals:
-        """The coefficients of the columns for these directions, shape (sets, pieces, directions, signals); the smallest
-        ones where a direction is redundant."""
+        """The coefficients of the columns, the smallest ones where a direction is redundant, in the shape of `along`.
+
+        along: the coefficients of the basis, shape (sets, pieces, directions, signals).
+        """
         sets, pieces, directions, signals = along.shape
         turned = np.swapaxes(along, 1, 2).reshape(sets, directions, pieces * signals)
         if self.seen.all():
@@ -133,7 +136,7 @@ class _Factors:
 
 
 def _lengths(columns: Reals) -> Reals:
-    """The lengths of the columns, shape (sets, N, columns), 1 where a column is 0."""
+    """The lengths of the columns of each set, 1 where a column is 0; columns: shape (sets, N, columns)."""
     lengths = np.sqrt(np.einsum("bij,bij->bj", columns, columns))
     lengths[lengths == 0.0] = 1.0
     return np.asarray(lengths)

@@ -1,7 +1,7 @@
 """Many sets of regressors of one record, those that belong to one piece of the record apart from the others.
 
 The level, the slope and the start of a piece are 0 in all other pieces: of a record with a dozen pieces, most of a
-matrix of all regressors would be zeros. Pieces of one length have the same ones.
+matrix of all regressors would be zeros. Consecutive pieces of one length have the same ones, which are kept once.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class PieceRows:
 
     lengths: the number of rows of each piece.
     piece: the piece of each row, shape (N,).
-    equal: the pieces, those of one length that follow each other together.
+    equal: the groups of consecutive pieces of one length.
     """
 
     def __init__(self, lengths: Sequence[int]) -> None:
@@ -57,8 +57,8 @@ class PieceRows:
             piece, row = piece + count, row + count * length
 
     def of_ends(self, lines: Reals) -> Reals:
-        """Lines of shape (sets, pieces, longest, signals), filled up at their beginnings, as signals of the record,
-        shape (sets, N, signals)."""
+        """Returns the last rows of each piece's line, as many as the piece has, as signals of the record, shape (sets,
+        N, signals); lines: shape (sets, pieces, longest, signals)."""
         found = np.empty((len(lines), len(self.piece), lines.shape[-1]))
         for equal in self.equal:
             equal.lines(found)[...] = lines[:, equal.pieces, lines.shape[2] - equal.length :]
@@ -84,8 +84,8 @@ class Regressors:
     """Sets of regressors.
 
     common: those that belong to no single piece, shape (sets, N, others).
-    own: those of each of the equal pieces in its rows, shape (sets, length, each). Empty where no regressor belongs to
-    one piece; `places` is then None.
+    own: one array for each group of `places.rows.equal`, shape (sets, length, each): the regressors that every piece of
+    the group has in its rows. Empty where no regressor belongs to one piece; `places` is then None.
     places: which ones belong to one piece.
     """
 

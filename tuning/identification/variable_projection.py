@@ -145,10 +145,12 @@ def _slopes(
     """The slopes of the residuals at these points by each parameter, shape (points, N, parameters)."""
     points, count = at[which], at.shape[1]
     signed = np.where(points + bounded.step <= bounded.high, bounded.step, -bounded.step)
-    moved = points[:, None, :] + signed[:, :, None] * np.eye(count)
-    answers = sums_of(moved.reshape(-1, count), np.repeat(here.linear[which], count, axis=0))
-    answers = answers.reshape(len(points), count, -1)
-    change = np.swapaxes((answers - here.fitted(which)[:, None, :]) / signed[:, :, None], 1, 2)
+    # the points themselves by the same formula: the slope of a parameter without influence is 0, not a rounding error
+    moved = np.repeat(points[:, None, :], count + 1, axis=1)
+    moved[:, np.arange(count), np.arange(count)] += signed
+    answers = sums_of(moved.reshape(-1, count), np.repeat(here.linear[which], count + 1, axis=0))
+    answers = answers.reshape(len(points), count + 1, -1)
+    change = np.swapaxes((answers[:, :-1] - answers[:, -1:]) / signed[:, :, None], 1, 2)
     return -here.beyond(change, which)
 
 

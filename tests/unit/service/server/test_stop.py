@@ -1,9 +1,8 @@
-"""The end of a service, as processes: by a signal, and where it does not come to its start."""
+"""The end of a service: by a signal, and where it does not come to its start."""
 
 from __future__ import annotations
 
 import logging
-import os
 import signal
 import socket
 import sqlite3
@@ -169,17 +168,51 @@ def test_a_signal_after_everything_has_ended_ends_a_process_that_hangs(tmp_path:
         assert process.wait(120) == 0
 
 
-def test_the_log_says_what_was_awaited_when_the_signal_came(caplog: pytest.LogCaptureFixture) -> None:
+@pytest.fixture
+def said(caplog: pytest.LogCaptureFixture) -> Iterator[Callable[[], list[str]]]:
+    """What the handling of signals has logged; the signals have the handlers of before again at the end."""
     caplog.set_level(logging.INFO)
-    under_test, before = [TAG], {each: signal.getsignal(each) for each in SIGNALS}
-    try:
-        with Signals() as signals:
-            signals.tell(under_test.clear, lambda: f"it waits for {under_test}")
-            os.kill(os.getpid(), signal.SIGTERM)
-    finally:
-        for each in SIGNALS:
-            signal.signal(each, before[each])
-    assert caplog.messages == [f"SIGTERM: the service ends; it waits for ['{TAG}']"] and not under_test
+    before = {each: signal.getsignal(each) for each in SIGNALS}
+    yield lambda: [record.getMessage() for record in caplog.records if record.name == Signals.__module__]
+    for each, handler in before.items():
+        signal.signal(each, handler)
+
+
+def test_the_log_says_what_was_awaited_when_the_signal_came(said: Callable[[], list[str]]) -> None:
+    under_test = [TAG]
+    with Signals() as signals:
+        signals.tell(under_test.clear, lambda: f"it waits for {under_test}")
+        signal.raise_signal(signal.SIGTERM)
+    assert said() == [f"SIGTERM: the service ends; it waits for ['{TAG}']"] and not under_test
+
+
+def test_a_signal_that_came_before_has_the_end_called_at_once(said: Callable[[], list[str]]) -> None:
+    ended: list[int] = []
+    with Signals() as signals:
+        signal.raise_signal(signal.SIGINT)
+        assert not said()
+        signals.tell(lambda: ended.append(1), lambda: "nothing is awaited")
+        assert ended
+    assert said() == ["SIGINT: the service ends; nothing is awaited"]
+
+
+def test_a_further_signal_ends_what_the_first_could_not_end(said: Callable[[], list[str]]) -> None:
+    ended: list[int] = []
+
+    def end() -> None:
+        ended.append(len(ended))
+        if ended == [0]:
+            raise OSError(24, "too many open files")
+
+    with Signals() as signals:
+        signals.tell(end, lambda: f"waits at {ended}")
+        signal.raise_signal(signal.SIGTERM)
+        until(lambda: bool(said()), "word of what went wrong")
+        signal.raise_signal(signal.SIGTERM)
+    assert said() == [
+        "SIGTERM: the end of the service could not be begun; a further signal tries again",
+        "SIGTERM: the service ends; waits at [0]",
+    ]
 
 
 def test_signals_that_nobody_sent_are_the_callers_again() -> None:

@@ -30,7 +30,7 @@ class Record:
     u_earlier: tuple[Reals, ...] = ()
 
 
-@pytest.mark.parametrize("pieces", [(300,), (120, 180)], ids=["one piece", "two pieces"])
+@pytest.mark.parametrize("pieces", [(300,), (120, 180), (150, 2, 148)], ids=str)
 @pytest.mark.parametrize("block", [1, 3])
 @pytest.mark.parametrize("structure", [FIRST, SECOND], ids=lambda s: s.name)
 @pytest.mark.parametrize("loads", [0, 1])
