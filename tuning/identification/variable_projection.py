@@ -145,7 +145,7 @@ def _slopes(
     """The slopes of the residuals at these points by each parameter, shape (points, N, parameters)."""
     points, count = at[which], at.shape[1]
     signed = np.where(points + bounded.step <= bounded.high, bounded.step, -bounded.step)
-    # the points themselves by the same formula: the slope of a parameter without influence is 0, not a rounding error
+    # the points themselves in the same call, which rounds alike: the slope of a parameter without influence is then 0
     moved = np.repeat(points[:, None, :], count + 1, axis=1)
     moved[:, np.arange(count), np.arange(count)] += signed
     answers = sums_of(moved.reshape(-1, count), np.repeat(here.linear[which], count + 1, axis=0))
