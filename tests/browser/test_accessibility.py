@@ -64,6 +64,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[States]:
 def loops(pages: Pages, site: States) -> Page:
     page = pages.open(bypass_csp=True)
     expect(page.get_by_role("link", name=re.compile(r"\d abnormal"))).to_be_visible()
+    expect(page.get_by_role("row", name=AT_REST)).to_be_visible()
     return page
 
 
