@@ -21,8 +21,10 @@ class Signals:
 
     def __init__(self) -> None:
         self._asked = False
+        self._end: Callable[[], None] = lambda: None
+        self._awaited: Callable[[], str] = lambda: "it has not started yet"
         # A signal may interrupt any code: logging uses locks, this queue uses none.
-        self._heard: SimpleQueue[int | None] = SimpleQueue()
+        self._heard: SimpleQueue[tuple[int, str] | None] = SimpleQueue()
         self._reporter: threading.Thread | None = None
 
     def __enter__(self) -> Self:
@@ -39,39 +41,32 @@ class Signals:
             signal.signal(each, _leave if self._asked else handler)
 
     def tell(self, end: Callable[[], None], awaited: Callable[[], str]) -> None:
-        """Has `end` called by a thread of its own at each signal; where one has come already, before this returns.
+        """Calls `end` when a signal comes, or has come already.
 
-        end: may be called several times.
-        awaited: returns what the end of the service waits for, in words, at once. A signal that comes later has it
-        called before `end`: what was under test when the signal came may be restored a moment later.
+        awaited: returns what the end of the service waits for, in words, and takes no lock. It is asked before `end` is
+        called, as what is under test may be restored a moment later.
         """
+        self._end, self._awaited = end, awaited
+        self._reporter = threading.Thread(target=self._report, name="signals", daemon=True)
+        self._reporter.start()
         if self._asked:
             end()
-        self._reporter = threading.Thread(target=self._report, args=(end, awaited), name="signals", daemon=True)
-        self._reporter.start()
 
     def _hear(self, number: int, _frame: FrameType | None) -> None:
-        self._asked = True
-        self._heard.put(number)
+        self._heard.put((number, self._awaited()))
+        if not self._asked:
+            self._asked = True
+            self._end()
 
-    def _report(self, end: Callable[[], None], awaited: Callable[[], str]) -> None:
+    def _report(self) -> None:
         first = True
-        while (number := self._heard.get()) is not None:
+        while (heard := self._heard.get()) is not None:
+            number, awaited = heard
             name = signal.Signals(number).name
-            words = "what it waits for is not known"
-            try:
-                words = awaited()
-            except Exception:
-                _log.exception("%s: what the end of the service waits for could not be found out", name)
-            try:
-                end()
-            except Exception:
-                _log.exception("%s: the end of the service could not be begun; a further signal tries again", name)
-                continue
             if first:
-                _log.info("%s: the service ends; %s", name, words)
+                _log.info("%s: the service ends; %s", name, awaited)
             else:
-                _log.warning("%s again: the service is ending, and is not cut short; %s", name, words)
+                _log.warning("%s again: the service is ending, and is not cut short; %s", name, awaited)
             first = False
 
 
