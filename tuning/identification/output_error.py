@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations_with_replacement
 from typing import Generic, Protocol, TypeVar
 
@@ -192,7 +193,7 @@ class Fit(Generic[S]):
         """The regressors of all linear parameters for each theta, which has a time for each load disturbance of the
         hypothesis."""
         many, order = len(thetas), structure.order
-        loads, free = hypothesis.load_disturbances, self.start_is_free(hypothesis)
+        loads, free = hypothesis.load_disturbances, self._start_is_free(hypothesis)
         driven, stepped = self._plants(structure, hypothesis, thetas)
         given = [self._of_last_samples(driven.drive(self._driving, structure.zeros + 1))]
         if structure.feed_through:
@@ -243,7 +244,7 @@ class Fit(Generic[S]):
             if self.starts_are_free:
                 self._end_with_piece(responses, thetas[:, structure.lags + 1 :].T.ravel())
             found += responses.reshape(loads, many, self.samples).sum(axis=0)
-        if self.start_is_free(hypothesis):
+        if self._start_is_free(hypothesis):
             of_starts = np.swapaxes(further[:, loads * order :].reshape(many, len(self.pieces), order), 1, 2)
             started = stepped.of(slice(loads * many, None)).summed(of_starts)
             responses = averaged(started.drive(self._step[: self._longest]), self.block, 1)
@@ -252,7 +253,7 @@ class Fit(Generic[S]):
                 lines += np.swapaxes(responses[:, : equal.length, equal.pieces], 1, 2)
         return np.asarray(found)
 
-    def start_is_free(self, hypothesis: DisturbanceHypothesis) -> bool:
+    def _start_is_free(self, hypothesis: DisturbanceHypothesis) -> bool:
         """Whether each piece begins in a state of its own under this disturbance hypothesis."""
         return hypothesis.not_at_rest_initially or self.starts_are_free
 
@@ -265,7 +266,7 @@ class Fit(Generic[S]):
         A step at the start of a piece, to every state, represents any initial state and a load disturbance.
         """
         times = thetas[:, structure.lags :].T
-        if self.start_is_free(hypothesis):
+        if self._start_is_free(hypothesis):
             times = np.append(times, np.zeros((1, len(thetas))), axis=0)
         monic = structure.monic(thetas)
         # one call serves MV and every load disturbance, as call overhead dominates
@@ -355,12 +356,8 @@ class Fit(Generic[S]):
         max_step = np.append(np.full(structure.lags, MAX_LOG_STEP), np.full(times, 0.25 * self.period))
         step = np.append(np.full(structure.lags, LOG_STEP), np.full(times, LOG_STEP * self.period))
 
-        def regressors(thetas: Reals) -> Regressors:
-            return self.regressors(structure, hypothesis, thetas)
-
-        def sums(thetas: Reals, linear: Reals) -> Reals:
-            return self.sums(structure, hypothesis, thetas, linear)
-
+        regressors = partial(self.regressors, structure, hypothesis)
+        sums = partial(self.sums, structure, hypothesis)
         bounded = SearchBounds(low, high, max_step, step)
         found, rss = descend(regressors, self.y, np.array(starts), bounded, max_steps, RELATIVE_DECREASE, sums)
         return [found[i] for i in np.argsort(rss, kind="stable")]

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import numpy as np
 
@@ -20,7 +21,6 @@ from loopwright.tuning.identification.output_error import (
     count,
 )
 from loopwright.tuning.identification.record import RecordedTest
-from loopwright.tuning.identification.regressors import Regressors
 from loopwright.tuning.identification.residuals import variance_inflation, whiteness
 from loopwright.tuning.identification.sensitivity import sensitivities, slopes_of
 from loopwright.tuning.identification.structures import Plant, Structure
@@ -130,12 +130,8 @@ class IdentificationProblem:
         max_step = np.append(np.full(structure.lags, 1.5), np.full(times, max(5.0, 0.2 * self.max_dead_time)))
         step = np.append(np.full(structure.lags, 1e-5), np.full(times, 1e-4))
 
-        def regressors(thetas: Reals) -> Regressors:
-            return self.full_fit.regressors(structure, hypothesis, thetas)
-
-        def sums(thetas: Reals, linear: Reals) -> Reals:
-            return self.full_fit.sums(structure, hypothesis, thetas, linear)
-
+        regressors = partial(self.full_fit.regressors, structure, hypothesis)
+        sums = partial(self.full_fit.sums, structure, hypothesis)
         bounded = SearchBounds(low, high, max_step, step)
         found, rss = descend(regressors, self.y, np.array(begun), bounded, MAX_STEPS, RELATIVE_DECREASE, sums)
         return self.fitted(structure, hypothesis, found[np.argmin(rss)])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopwright.tuning.identification.regressors import Flags, Regressors, Rows
+from loopwright.tuning.identification.regressors import Flags, OwnColumns, Regressors, Rows
 from loopwright.tuning.models import Reals
 
 REDUNDANT = 1e-10
@@ -22,7 +22,7 @@ REDUNDANT = 1e-10
 class Projection:
     """The best linear fit of y by each set of regressors.
 
-    regressors: the regressors.
+    places: which of the regressors belong to one piece; None where none does.
     own: an orthonormal basis of the regressors of each group of equal pieces, shape (sets, length, directions); empty
     where no regressor belongs to one piece.
     common: an orthonormal basis of the other regressors, orthogonal to those of the pieces, shape (sets, N, others).
@@ -30,7 +30,7 @@ class Projection:
     rest: the residual, shape (sets, N).
     """
 
-    regressors: Regressors
+    places: OwnColumns | None
     own: tuple[Reals, ...]
     common: Reals
     linear: Reals
@@ -44,8 +44,8 @@ class Projection:
         rest = np.repeat(y[None, :, None], len(common), axis=0)
         if places is None:
             factors = _Factors.of(common)
-            along = factors.coefficients(_take_out(factors.basis, rest)[:, None])[:, 0, :, 0]
-            return Projection(regressors, (), factors.basis, along / lengths, rest[:, :, 0])
+            linear = factors.coefficients(_take_out(factors.basis, rest)[:, None])[:, 0, :, 0] / lengths
+            return Projection(None, (), factors.basis, linear, rest[:, :, 0])
         signals = np.concatenate((rest, common), axis=2)
         own, solutions = [], []
         for equal, columns in zip(places.rows.equal, regressors.own, strict=True):
@@ -62,21 +62,17 @@ class Projection:
         for equal, solution in zip(places.rows.equal, solutions, strict=True):
             without = solution[..., 0] - (solution[..., 1:] @ found[:, None])[..., 0]
             linear[:, places.own[equal.pieces]] = without
-        return Projection(regressors, tuple(own), factors.basis, linear, rest[:, :, 0])
+        return Projection(places, tuple(own), factors.basis, linear, rest[:, :, 0])
 
     @property
     def rss(self) -> Reals:
         return np.asarray(np.einsum("bi,bi->b", self.rest, self.rest))
 
-    def fitted(self, which: Rows) -> Reals:
-        """What these sets make of y, shape (sets, N)."""
-        return self.regressors.of(which).times(self.linear[which])
-
     def beyond(self, signals: Reals, which: Rows) -> Reals:
         """What is left of the signals, shape (sets, N, signals), beyond the regressors of these sets."""
         left = signals.copy()
-        if (places := self.regressors.places) is not None:
-            for equal, basis in zip(places.rows.equal, self.own, strict=True):
+        if self.places is not None:
+            for equal, basis in zip(self.places.rows.equal, self.own, strict=True):
                 _take_out(basis[which, None], equal.lines(left))
         _take_out(self.common[which], left)
         return left
@@ -87,7 +83,7 @@ class Projection:
             mine[where] = other[which]
 
     def _arrays(self) -> Sequence[Reals]:
-        return self.regressors.common, *self.regressors.own, *self.own, self.common, self.linear, self.rest
+        return *self.own, self.common, self.linear, self.rest
 
 
 @dataclass(frozen=True, slots=True, eq=False)

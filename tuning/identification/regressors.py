@@ -115,7 +115,3 @@ class Regressors:
             lines = equal.lines(found)[..., 0]
             lines += np.swapaxes(own @ np.swapaxes(linear[:, self.places.own[equal.pieces]], 1, 2), 1, 2)
         return np.asarray(found[:, :, 0])
-
-    def of(self, which: Rows) -> Regressors:
-        """Some of the sets."""
-        return Regressors(self.common[which], tuple(own[which] for own in self.own), self.places)

@@ -78,7 +78,7 @@ def test_coefficients_and_residual_are_those_of_least_squares(places: OwnColumns
         assert found.linear[i] == pytest.approx(expected, rel=1e-9, abs=1e-18)
         assert found.rest[i] == pytest.approx(y - columns[i] @ expected, abs=1e-12)
         assert found.rss[i] == pytest.approx(rss, rel=1e-12)
-    assert found.fitted(SETS) == pytest.approx(y - found.rest, abs=1e-12)
+    assert given.times(found.linear) == pytest.approx(y - found.rest, abs=1e-12)
 
 
 def test_what_is_left_of_a_signal_is_that_of_all_regressors_at_once(places: OwnColumns) -> None:
@@ -106,8 +106,8 @@ def test_a_regressor_that_others_make_up_leaves_the_residual(places: OwnColumns,
         rss = np.linalg.lstsq(others, y, rcond=None)[1]
         assert np.isfinite(again.linear).all() and np.isfinite(less.linear).all()
         assert [again.rss[i], less.rss[i]] == pytest.approx([rss[0]] * 2, rel=1e-9)
-        assert columns[i] @ again.linear[i] == pytest.approx(again.fitted(SETS)[i], abs=1e-12)
-        assert np.sum((y - again.fitted(SETS)[i]) ** 2) == pytest.approx(rss, rel=1e-9)
+        assert columns[i] @ again.linear[i] == pytest.approx(y - again.rest[i], abs=1e-12)
+        assert np.sum((y - columns[i] @ again.linear[i]) ** 2) == pytest.approx(rss, rel=1e-9)
     assert (without < again.rss).all()
 
 
@@ -132,4 +132,4 @@ def test_sets_are_replaced_in_all_that_is_known_of_them(places: OwnColumns) -> N
         of = expected[int(better[i])]
         assert found.rss[i] == pytest.approx(of.rss[i], rel=1e-12)
         assert found.beyond(signals, SETS)[i] == pytest.approx(of.beyond(signals, SETS)[i], abs=1e-12)
-        assert found.fitted(SETS)[i] == pytest.approx(of.fitted(SETS)[i], abs=1e-9)
+        assert found.linear[i] == pytest.approx(of.linear[i], rel=1e-9)
