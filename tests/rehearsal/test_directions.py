@@ -108,7 +108,7 @@ def test_a_gain_that_differs_below_is_refused_where_MV_goes_there(below: float, 
 
 @pytest.mark.parametrize("seed", [2, 16])
 def test_where_MV_hardly_goes_there_the_gains_hold_for_the_side_that_was_tested(seed: int) -> None:
-    """Under other noise the difference shows and is refused; under that of some seeds it hangs by a rounding error."""
+    """Under other noise the difference shows and is refused; under some of it, whether it shows depends on rounding."""
     found = of_two_sided(0.7, Directions.UP, 0.25, 12.0, seed).value
     assert found is not None and any(UNSEEN in note for note in found.notes)
     above, below = (margins(FOPDT(K, 10.0, 2.0 + 0.05), found.gains).Ms for K in (2.0, 1.4))

@@ -29,6 +29,22 @@ class Loop:
         return LinearPlant(self.num, self.den, self.L, Ts, mv_nominal=MV, pv_nominal=PV, noise_std=noise, seed=seed)
 
 
+@dataclass(frozen=True, slots=True)
+class SampledPieces:
+    """A record that a fit takes, with the scales that suit samples of 0.1 s of these plants."""
+
+    u: Reals
+    y: Reals
+    block: int
+    pieces: tuple[int, ...]
+    u_earlier: tuple[Reals, ...] = ()
+    Ts: float = 0.1
+    input_range: float = 1.0
+    output_range: float = 1.0
+    period: float = 60.0
+    max_dead_time: float = 60.0
+
+
 FIRST_ORDER = Loop((2.0,), (10.0, 1.0), 2.03, 1.5, 8.0)
 NEGATIVE = Loop((-1.5,), (8.0, 1.0), 2.0, 1.0, 8.0)
 PROMPT = Loop((1.0,), (5.0, 1.0), 0.0, 1.0, 3.0)

@@ -64,7 +64,7 @@ class AnsweringBus:
 
     def recv(self, timeout: float | None) -> Frame | None:
         until = self.now + (timeout or 0.0)
-        self.now = min(until, *(at for at, _ in self._coming[:1]), until)
+        self.now = min([until, *(at for at, _ in self._coming)])
         if self._coming and self._coming[0][0] <= self.now:
             return sdo_response_id(0x33), self._coming.pop(0)[1]
         return None

@@ -2,32 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
 from loopwright.tuning.identification.disturbances import rss_by_load_time
 from loopwright.tuning.identification.output_error import DisturbanceHypothesis, Fit
 from loopwright.tuning.identification.structures import FIRST, SECOND, Structure
-from loopwright.tuning.models import Reals
-from tests.unit.tuning.recordings import COMPLEX_POLES, PV, moves, open_loop
-
-
-@dataclass(frozen=True)
-class Record:
-    """A record of samples of 0.1 s in its own units."""
-
-    u: Reals
-    y: Reals
-    block: int
-    pieces: tuple[int, ...]
-    Ts: float = 0.1
-    input_range: float = 1.0
-    output_range: float = 1.0
-    period: float = 60.0
-    max_dead_time: float = 60.0
-    u_earlier: tuple[Reals, ...] = ()
+from tests.unit.tuning.recordings import COMPLEX_POLES, PV, SampledPieces, moves, open_loop
 
 
 @pytest.mark.parametrize("pieces", [(300,), (120, 180), (150, 2, 148)], ids=str)
@@ -38,7 +19,7 @@ def test_every_time_leaves_what_a_fit_with_a_load_at_that_time_leaves(
     structure: Structure, block: int, pieces: tuple[int, ...], loads: int
 ) -> None:
     u = moves(300)
-    fit = Fit(Record(u, open_loop(COMPLEX_POLES, u, noise=0.05)[2] - PV, block, pieces))
+    fit = Fit(SampledPieces(u, open_loop(COMPLEX_POLES, u, noise=0.05)[2] - PV, block, pieces))
     rates = [[-2.0], [-3.5]] if structure is FIRST else [[-1.5, -4.0], [-0.5, -3.0]]
     thetas = np.array([[*each, L, *[45.0] * loads] for each, L in zip(rates, (6.0, 11.4), strict=True)])
     shifts = np.arange(0, fit.samples - 12, 7)

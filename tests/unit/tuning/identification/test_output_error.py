@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -17,8 +16,7 @@ from loopwright.tuning.identification.structures import (
     THIRD_WITH_ZERO,
     Structure,
 )
-from loopwright.tuning.models import Reals
-from tests.unit.tuning.recordings import moves
+from tests.unit.tuning.recordings import SampledPieces, moves
 
 STRUCTURES = [FIRST, LAGGED_INTEGRATOR, SECOND_WITH_FEED_THROUGH, THIRD_WITH_ZERO]
 HYPOTHESES = [
@@ -30,22 +28,6 @@ HYPOTHESES = [
 ]
 
 
-@dataclass(frozen=True)
-class Record:
-    """A record of samples of 1 s in its own units."""
-
-    u: Reals
-    y: Reals
-    block: int
-    pieces: tuple[int, ...]
-    u_earlier: tuple[Reals, ...]
-    Ts: float = 1.0
-    input_range: float = 2.0
-    output_range: float = 3.0
-    period: float = 60.0
-    max_dead_time: float = 60.0
-
-
 @pytest.mark.parametrize("hypothesis", HYPOTHESES, ids=str)
 @pytest.mark.parametrize("structure", STRUCTURES, ids=lambda s: s.name)
 @pytest.mark.parametrize("pieces", [(300,), (100, 100, 100), (90, 61, 149), (150, 2, 148)], ids=str)
@@ -55,7 +37,8 @@ def test_the_sums_of_the_regressors_are_those_of_all_their_columns(
 ) -> None:
     rng = np.random.default_rng(7)
     u = moves(300)
-    fit = Fit(Record(u, rng.normal(size=300), block, pieces, tuple(rng.normal(size=20) for _ in pieces)))
+    before = tuple(rng.normal(size=20) for _ in pieces)
+    fit = Fit(SampledPieces(u, rng.normal(size=300), block, pieces, before, input_range=2.0, output_range=3.0))
     logs = rng.uniform(-4.0, -2.0, (4, structure.lags))
     # the dead time, then the times of the load disturbances, one of them where pieces of 100 samples meet
     times = np.column_stack((rng.uniform(0.0, 30.0, 4), np.full(4, 100.0), rng.uniform(150.0, 280.0, 4)))
@@ -71,7 +54,7 @@ def test_a_time_that_the_record_does_not_show_is_not_searched(seed: int) -> None
     """A load disturbance at the last sample of a piece ends with it, before PV has moved. A slope that is a rounding
     error, of a plant with slow lags, would move its time as far as a step may go."""
     drifting = np.cumsum(np.random.default_rng(seed).normal(size=300))
-    fit = Fit(Record(moves(300), drifting, 1, (100, 100, 100), ()))
+    fit = Fit(SampledPieces(moves(300), drifting, 1, (100, 100, 100)))
     theta = np.array([math.log(1e-4), math.log(1e-6), 5.0, 199.0])
     (found,) = fit.descended(SECOND, DisturbanceHypothesis(load_disturbances=1, drift=True), [theta], 8)
     assert found.theta[-1] == 199.0 and np.all(found.theta[:2] != theta[:2])
