@@ -179,6 +179,11 @@ class Failed(Ended):
     """Something broke or ran out on the way."""
 
 
+class FalsePv(Failed):
+    """PV is false within its limits: it stands still, or has jumped, as the plant cannot. The loop is not given back to
+    automatic on such a PV."""
+
+
 class NoGain(Ended):
     """Nothing that was asked for would improve, so the present gains are kept."""
 
