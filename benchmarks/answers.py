@@ -53,6 +53,15 @@ def processor_s(pid: int) -> float:
     return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
+def family_s(pid: int) -> float:
+    """Of a process and of all below it, those that have ended included."""
+    try:
+        threads = [each.read_text() for each in Path(f"/proc/{pid}/task").glob("*/children")]
+        return processor_s(pid) + sum(family_s(int(child)) for child in " ".join(threads).split())
+    except (FileNotFoundError, ProcessLookupError):  # it has just ended, and its parent counts it
+        return 0.0
+
+
 def answered_ms(url: str, paths: list[str], rate_per_s: float = RATE_PER_S) -> list[float]:
     """Waiting times for GETs sent by the clock, ms, sorted: from when each was due, so that a slow answer is not
     excused by the requests it kept from being sent."""
@@ -85,7 +94,7 @@ def answered_ms(url: str, paths: list[str], rate_per_s: float = RATE_PER_S) -> l
 
 class Gateway:
     def __init__(self, folder: Path) -> None:
-        arguments = ("benchmarks.rehearsed", str(folder), "local", str(max(LOOPS)), str(max(LOOPS)), "1", "")
+        arguments = ("benchmarks.rehearsed_gateway", str(folder), "local", str(max(LOOPS)), str(max(LOOPS)), "1", "")
         self.process = ChildProcess("service", arguments, folder / "log")
 
     def __enter__(self) -> Gateway:

@@ -1,8 +1,6 @@
 """Live loops without a bus: the controller's algorithm and a plant model in memory, behind the configuration of a loop.
 
-A gateway of its own process, which tunes so many of them:
-
-    python -m benchmarks.rehearsed FOLDER HOST LOOPS AT_ONCE PACE DATABASE
+`benchmarks.rehearsed_gateway` is a gateway that tunes so many of them, as a process of its own.
 """
 
 from __future__ import annotations
@@ -78,7 +76,8 @@ def open_loop(_config: LoopConfig, pace: float = 0.0) -> RehearsedLoop:
 
 
 def main() -> None:
-    parser = parser_of(__doc__)
+    """A gateway that tunes such loops."""
+    parser = parser_of("A gateway that tunes loops without a bus: the controller's algorithm and a plant in memory.")
     parser.add_argument("folder", type=Path, help="for its configuration and its data")
     parser.add_argument("host", help="its name, and the beginning of its loops' tags")
     parser.add_argument("loops", type=int, help="how many")
@@ -94,7 +93,3 @@ def main() -> None:
     file.write_text(yaml.safe_dump({"loops": entries, "buses": {bus: {"at_once": given.at_once}}}))
     setup = Setup(file, folder / "data", "127.0.0.1", 0, given.database or None, host)
     serve(setup, partial(open_loop, pace=given.pace))
-
-
-if __name__ == "__main__":
-    main()

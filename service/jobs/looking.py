@@ -101,12 +101,18 @@ class Looking:
         if began_s < self._latest_s:  # the clock was put back, and with it the history
             self._loops = {tag: _Loop() for tag in self._loops}
         self._latest_s = began_s
-        looked = []
-        for config in self._directory.loops.values():
+        looked: list[str] = []
+        due = [
+            config
+            for config in self._directory.loops.values()
+            if config.setpoint_from != "remote" and began_s >= self._loops[config.tag].due_s
+        ]
+        waiting = self._store.busy() if due else {}  # of all loops at once: a job that begins now is under test
+        for config in due:
             if self._stopping():
                 break
             known, now_s = self._loops[config.tag], self._wall()
-            if config.setpoint_from == "remote" or now_s < known.due_s or self._busy(config.tag):
+            if config.tag in waiting or self._under_test(config.tag):
                 continue
             known.due_s = now_s + CHECK_S
             try:
@@ -157,9 +163,6 @@ class Looking:
         log.info("looked at the history of %s: %s; %s", config.tag, found.known, found.detail)
         self._knowledge.observed(found, self._spec.Ms, state.sample_time_s)
         return True
-
-    def _busy(self, tag: str) -> bool:
-        return self._under_test(tag) or self._store.active(tag) is not None
 
     def _under_test(self, tag: str) -> bool:
         return tag in self._registry.under_test().values()

@@ -276,7 +276,9 @@ class Worker:
             if self._registry.stopping and self.journal.behind_s > STOP_PATIENCE_S:
                 log.error("the database accepts nothing, the last reports of the job are lost")
                 break
-        times = self._earlier_times(running.job_id) | outcome.plant_time_s
+        events = self._lasting(lambda: self.store.events(running.job_id))
+        earlier = {done.stage: done.stage_time_s for event in events if (done := event.stage_ended())}
+        times = earlier | outcome.plant_time_s
         columns: JobColumns = {
             "result": outcome.result,
             "stage_times_s": times,
@@ -291,7 +293,7 @@ class Worker:
             state = state_after(outcome.ended)
             columns |= {"reason": outcome.ended.reason.value, "detail": outcome.ended.detail}
         job = self._move(running.job_id, state, **columns)
-        self._lasting(lambda: self._operation.outdated(job, self.store.events(job.id)))
+        self._lasting(lambda: self._operation.outdated(job, events))
         self._knowledge.tested(job, running.pv_range, running.mv_range)
         self._ended(job)
         if outcome.ended is None:
@@ -299,8 +301,3 @@ class Worker:
         else:
             level = logging.INFO if state in GOOD else logging.WARNING
             log.log(level, "job %s, %s: %s", state.value, outcome.ended.reason.value, outcome.ended.detail)
-
-    def _earlier_times(self, job_id: str) -> dict[str, float]:
-        """Returns the plant time by stage that any attempt has finished, s."""
-        events = self._lasting(lambda: self.store.events(job_id))
-        return {done.stage: done.stage_time_s for event in events if (done := event.stage_ended())}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict
 
-from sqlalchemy import func, select
+from sqlalchemy import func, insert, select
 from sqlalchemy.orm import Session
 
 from loopwright.service.jsonable import JsonObject, json_object, to_jsonable
@@ -14,7 +14,7 @@ from loopwright.service.states.loop_state import gains_of, same_gains
 from loopwright.service.store import audit, claims, late, loop_locks
 from loopwright.service.store.clock import now
 from loopwright.service.store.jobs import JobColumns
-from loopwright.service.store.tables import EventRow, JobRow
+from loopwright.service.store.tables import ChunkRow, EventRow, JobRow
 from loopwright.tuning.reasons import Reason
 
 DECISIONS = {JobState.ACCEPTED: "accept", JobState.ROLLED_BACK: "rollback"}
@@ -22,6 +22,7 @@ DECISIONS = {JobState.ACCEPTED: "accept", JobState.ROLLED_BACK: "rollback"}
 BEGUN = "decision_begun"
 """The event that a decision writes before it writes to the controller: only without it is a proposal known to have
 left the old gains in effect. Its decision is `unknown` where the database may be older than the last decision."""
+_LOCKED = "jobs whose rows are locked"
 _CUT_SHORT = (JobState.ABORTED, JobState.FAILED)
 """Ends of a job that was told to stop; `failed` where its loop could not be restored."""
 
@@ -36,10 +37,15 @@ class NoSuchJob(Exception):
 
 def find(session: Session, job_id: str, lock: bool = False) -> JobRow:
     """lock: nobody else, on whatever host, changes the job or appends to it before this transaction ends."""
+    locked: dict[str, JobRow] = session.info.setdefault(_LOCKED, {})
+    if job_id in locked:  # by this transaction, whose session is closed with it: the row is as it has it
+        return locked[job_id]
     wanted = select(JobRow).where(JobRow.id == job_id)
     row = session.scalars(wanted.with_for_update() if lock else wanted).one_or_none()
     if row is None:
         raise NoSuchJob(job_id)
+    if lock:
+        locked[job_id] = row
     return row
 
 
@@ -86,12 +92,17 @@ def append(
     session: Session, job_id: str, kind: str, data: Mapping[str, object], plant_time_s: float, at: str | None = None
 ) -> int:
     """The next event of a job whose row this transaction has locked. Returns its number."""
-    seq = 1 + (session.scalar(select(func.max(EventRow.seq)).where(EventRow.job_id == job_id)) or 0)
-    session.add(
-        EventRow(job_id=job_id, seq=seq, at=at or now(), plant_time_s=plant_time_s, kind=kind, data=json_object(data))
-    )
-    session.flush()
-    return seq
+    values = {"at": at or now(), "plant_time_s": plant_time_s, "kind": kind, "data": json_object(data)}
+    return add_next(session, EventRow, job_id, values)
+
+
+def add_next(session: Session, table: type[EventRow | ChunkRow], job_id: str, values: Mapping[str, object]) -> int:
+    """Adds the next row of a job, whose row this transaction has locked or which no other writes. Returns its
+    number."""
+    last = select(func.max(table.seq)).where(table.job_id == job_id).scalar_subquery()
+    row = insert(table).values(job_id=job_id, seq=1 + func.coalesce(last, 0), **values)
+    with session.no_autoflush:  # a change of the job is stored once, at the end of the transaction
+        return session.scalars(row.returning(table.seq)).one()
 
 
 def note_stop(session: Session, job_id: str, reason: Reason, by: str, heard: bool, at: str | None = None) -> JobRow:

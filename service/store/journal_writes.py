@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from contextvars import Context
 
-from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from loopwright.service.jsonable import json_object
@@ -14,7 +13,7 @@ from loopwright.service.security.principal import current as principal
 from loopwright.service.states.job_state import IllegalMove
 from loopwright.service.store import claims, sample_blocks
 from loopwright.service.store.clock import now
-from loopwright.service.store.job_rows import append, find, note_stop
+from loopwright.service.store.job_rows import add_next, append, find, note_stop
 from loopwright.service.store.tables import ChunkRow, EventRow
 from loopwright.tuning.plan import Sample
 from loopwright.tuning.reasons import Reason
@@ -54,9 +53,8 @@ def block_of(job_id: str, stage: str, samples: Sequence[Sample]) -> Write:
         stored = session.get(ChunkRow, (job_id, seq)) if seq else None
         if stored is not None and (stored.first_t_s, stored.data) == (first_t_s, data):
             return  # only the answer to the COMMIT was lost
-        seq = 1 + (session.scalar(select(func.max(ChunkRow.seq)).where(ChunkRow.job_id == job_id)) or 0)
-        session.add(ChunkRow(job_id=job_id, seq=seq, stage=stage, first_t_s=first_t_s, count=count, data=data))
-        session.flush()
+        values = {"stage": stage, "first_t_s": first_t_s, "count": count, "data": data}
+        seq = add_next(session, ChunkRow, job_id, values)
 
     return write
 

@@ -20,9 +20,13 @@ def binaries() -> Path | None:
 
 
 class Server:
-    """Runs from its making to `close`; `stop` and `start` in between are what a test does to it."""
+    """Runs from its making to `close`; `stop` and `start` in between are what a test does to it.
 
-    def __init__(self, folder_of_binaries: Path) -> None:
+    settings: further settings of the server, as name=value.
+    """
+
+    def __init__(self, folder_of_binaries: Path, *settings: str) -> None:
+        self._settings = settings
         self._bin = folder_of_binaries
         self.folder = Path(tempfile.mkdtemp(prefix="loopwright-pg-"))
         self._user: str | None = None
@@ -36,6 +40,7 @@ class Server:
 
     def start(self) -> None:
         settings = f"-k {self.folder} -c listen_addresses='' -c fsync=off -c max_connections=300"
+        settings += "".join(f" -c {setting}" for setting in self._settings)
         log = str(self.folder / "log")
         self._run("pg_ctl", "-D", str(self._data), "-l", log, "-o", settings, "-w", "start")
 

@@ -83,7 +83,7 @@ def test_a_name_that_nothing_has_is_one_line_with_those_that_are(
         (["benchmarks.tuning", "--seeds", "x"], "--seeds"),
         (["benchmarks.tuning", "--of", "nowhere"], "no run: nowhere"),
         (["benchmarks.fast", "x"], "records"),
-        (["benchmarks.rehearsed"], "folder"),
+        (["benchmarks.rehearsed_gateway"], "folder"),
         (["validation.__main__", "nonsense"], "nonsense"),
         (["tests.faults.__main__", "--faults", "nonsense"], "nonsense"),
         (["tests.simulation.__main__", "--kinds", "nonsense"], "nonsense"),
