@@ -148,9 +148,7 @@ def _states(engine: Engine, jobs: int) -> dict[str, int]:
     """How many jobs there are in which state, once as many as that have ended."""
     while True:
         with engine.connect() as connection:
-            found = {
-                row[0]: int(row[1]) for row in connection.execute(_STATES)
-            }
+            found = {row[0]: int(row[1]) for row in connection.execute(_STATES)}
         if not found.keys() & {str(state.value) for state in ACTIVE} and sum(found.values()) == jobs:
             return found
         time.sleep(0.1)

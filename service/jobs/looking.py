@@ -105,7 +105,9 @@ class Looking:
         due = [
             config
             for config in self._directory.loops.values()
-            if config.setpoint_from != "remote" and began_s >= self._loops[config.tag].due_s
+            if config.setpoint_from != "remote"
+            and config.bus not in self._listening.off  # nothing new is heard of it
+            and began_s >= self._loops[config.tag].due_s
         ]
         waiting = self._store.busy() if due else {}  # of all loops at once: a job that begins now is under test
         for config in due:

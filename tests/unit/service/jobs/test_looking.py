@@ -27,6 +27,7 @@ class OneLoop(HeardBefore):
     """What was heard of TIC-101; of FIC-2 nothing was."""
 
     rings: Rings
+    off: dict[str, str] = {}
 
     def history(self, tag: str, from_s: float, to_s: float, points: int) -> Any:
         return HeardBefore(self.rings if tag == TAG else Rings()).history(tag, from_s, to_s, points)
@@ -83,6 +84,22 @@ def test_changes_of_operators_are_looked_at_once_and_known(service: Service) -> 
     assert here.looking.look_at_due_loops() == [], "operation goes on, and nobody moved the set-point"
     here.goes_on(LOOK_EVERY_S, {4000: 0.5})
     assert here.looking.look_at_due_loops() == [TAG] and here.pool.kinds == 2 * [ComputationKind.LOOK]
+
+
+def test_a_loop_that_is_not_heard_is_not_looked_at(service: Service) -> None:
+    here = Looked(service, dict(MOVES))
+    here.listening.off = dict.fromkeys({loop.bus for loop in service.jobs.directory.loops.values()}, "off")
+    assert here.looking.look_at_due_loops() == []
+
+
+def test_the_looks_of_all_loops_ask_once_which_have_a_job(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    here, asked = Looked(service, dict(MOVES)), list[str]()
+    busy = service.store.busy
+    monkeypatch.setattr(service.store, "busy", lambda: asked.append("") or busy())
+    here.looking.look_at_due_loops()
+    assert len(asked) == 1 and len(service.jobs.directory.loops) > 1
+    here.looking.look_at_due_loops()
+    assert len(asked) == 1, "no loop is due"
 
 
 def test_a_change_is_looked_at_when_it_has_been_followed(service: Service) -> None:
