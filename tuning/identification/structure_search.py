@@ -31,7 +31,7 @@ from loopwright.tuning.identification.structures import (
     SECOND_WITH_ZERO,
     THIRD,
 )
-from loopwright.tuning.models import TransferFunction
+from loopwright.tuning.models import Reals, TransferFunction
 from loopwright.tuning.reasons import Ended
 
 STRUCTURES = (*SEVEN, THIRD, INTEGRATOR, LAGGED_INTEGRATOR, INTEGRATOR_WITH_ZERO)
@@ -41,7 +41,7 @@ of MV; a slower one is not supported by the record."""
 MIN_MOVE = 0.2
 """Smallest change of MV, as a fraction of the largest, that counts as a move."""
 FEW_MOVES = 2
-"""Number of moves up to which a record shows a load disturbance apart from the plant's response only where that response
+"""Number of moves up to which a record shows a load disturbance apart from the plant's response only where the response
 is over. Moves on in the same direction, before the response is over, are one."""
 NEAR_A_MOVE = 0.02
 """Distance from a move of MV, as a fraction of the record, within which a load disturbance comes with the move."""
@@ -136,8 +136,8 @@ def confounded(problem: IdentificationProblem, fit: Fitted) -> bool:
     It may be
 
     - where MV is not needed for the fit, or where two load disturbances come together;
-    - where a load disturbance undoes MV's last move, or brings MV and the loads together back to where MV began: a plant
-      that integrates is then one that settles;
+    - where a load disturbance undoes MV's last move, or brings MV and the loads together back to where MV began: what
+      integrates may then be what settles;
     - in a record of few moves, where a load disturbance comes before the response to the last move is over, or slows
       down a plant that integrates: a slow part of the plant looks the same;
     - in a record of few moves, where PV before its first answer does not show the drift.

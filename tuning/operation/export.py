@@ -10,6 +10,7 @@ import numpy as np
 
 from loopwright.tuning.models import Reals
 from loopwright.tuning.operation.history import Stretch
+from loopwright.tuning.operation.recorded_control import at_limit
 from loopwright.tuning.reasons import Reason, Refused
 
 MAX_REPEATED, MAX_STRAIGHT = 0.5, 0.5
@@ -88,9 +89,11 @@ def _followed(stretch: Stretch, lag: int) -> tuple[float, float]:
     if gains.Td:
         slope = np.diff(stretch.pv, prepend=stretch.pv[0]) / Ts
         asked = asked - gains.Kp * gains.Td * np.diff(slope)
-    moves = np.diff(stretch.mv)
+    moves, limited = np.diff(stretch.mv), at_limit(stretch.mv)
+    free = ~(limited[1:] | limited[:-1])  # at a limit MV moves less than was asked for
     first, last = max(lag, 0), min(lag, 0)
-    moves, asked = moves[first : len(moves) + last], asked[first - lag : len(asked) - lag + last]
+    moves, free = moves[first : len(moves) + last], free[first : len(free) + last]
+    moves, asked = moves[free], asked[first - lag : len(asked) - lag + last][free]
     power = float(asked @ asked)
     if power == 0.0 or not np.any(moves):
         return 0.0, 0.0

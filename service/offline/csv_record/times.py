@@ -18,7 +18,12 @@ import numpy as np
 from loopwright.service.offline.csv_record.dates_as_numbers import are_days, compact_dates
 from loopwright.service.offline.csv_record.errors import Unusable, counted
 from loopwright.service.offline.csv_record.numbers import numbers
-from loopwright.service.offline.csv_record.time_units import require_known, require_possible, seconds_in
+from loopwright.service.offline.csv_record.time_units import (
+    require_known,
+    require_possible,
+    require_s_likely,
+    seconds_in,
+)
 from loopwright.tuning.models import Reals
 
 _EPOCHS = ((1e18, 1e-9), (1e17, 1e-7), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))
@@ -126,6 +131,7 @@ def _of_numbers(cells: Sequence[str], lines: Sequence[int], unit: str, name: str
     if are_days(times, cells, name):
         return _from_first(times) * _DAY
     require_known(unit, name)
+    require_s_likely(times, name)
     return times
 
 
