@@ -48,6 +48,8 @@ NO_WEIGHT = 0.005
 """Set-point weight below which there is none."""
 EXACT = 1e-6
 """Part of the variance of MV's moves below which nothing is left for a derivative."""
+ROUNDING = 1e-9
+"""Distance from the prediction, as a fraction of the largest value, within which no sample is left out."""
 ENDS_OF_RANGE = (0.0, 100.0)
 """Values of MV in % that are limits although MV was there once."""
 
@@ -146,7 +148,7 @@ def _fitted(columns: Reals, wanted: Reals) -> tuple[Reals, Bools]:
     found = np.linalg.lstsq(columns, wanted, rcond=None)[0]
     for _ in range(PASSES):
         distance = np.abs(wanted - columns @ found)
-        kept = distance <= np.partition(distance, stays - 1)[stays - 1]
+        kept = distance <= max(np.partition(distance, stays - 1)[stays - 1], ROUNDING * np.max(np.abs(wanted)))
         found = np.linalg.lstsq(columns[kept], wanted[kept], rcond=None)[0]
     return np.asarray(found, dtype=np.float64), kept
 

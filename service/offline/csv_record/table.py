@@ -199,17 +199,19 @@ def _named_without_samples(
 
 def _samples(lines: Sequence[tuple[int, str]]) -> tuple[int, str] | None:
     """The place of the first line with samples, and the sign between the cells; None where no line has any."""
-    best: tuple[int, int, str] | None = None
+    best: tuple[float, int, str] | None = None
     for delimiter in DELIMITERS:
         places: dict[int, list[int]] = {}
+        parts: dict[int, float] = {}
         for at, (_, line) in enumerate(lines[:LOOKED_AT]):
-            if delimiter in line and _looks_like_samples(cells := _cells(line, delimiter)):
+            if delimiter in line and (part := _part_of_values(cells := _cells(line, delimiter))):
                 places.setdefault(len(cells), []).append(at)
+                parts[len(cells)] = parts.get(len(cells), 0.0) + part
                 if len(places[len(cells)]) == MANY_SAMPLES:
                     break
-        for found in places.values():
-            if best is None or len(found) > best[0]:
-                best = (len(found), _first_in_a_row(found, min(len(lines), LOOKED_AT)), delimiter)
+        for width, found in places.items():
+            if best is None or parts[width] > best[0]:
+                best = (parts[width], _first_in_a_row(found, min(len(lines), LOOKED_AT)), delimiter)
     return None if best is None else best[1:]
 
 
@@ -223,11 +225,11 @@ def _first_in_a_row(places: Sequence[int], end: int) -> int:
     return places[0]
 
 
-def _looks_like_samples(cells: Sequence[str]) -> bool:
-    """Whether a line has at least two values, and no more words than values."""
+def _part_of_values(cells: Sequence[str]) -> float:
+    """The part of the cells of a line that are values; 0 for a line without two values, or with more words than that."""
     there = [cell for cell in cells if cell.strip()]
     values = sum(is_number(cell) or is_missing(cell) or is_on_or_off(cell) or _is_moment(cell) for cell in there)
-    return _figures(cells) >= 1 and values >= 2 and 2 * values >= len(there)
+    return values / len(there) if _figures(cells) >= 1 and values >= 2 and 2 * values >= len(there) else 0.0
 
 
 def _figures(cells: Sequence[str]) -> int:
