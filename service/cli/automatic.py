@@ -35,13 +35,13 @@ class AskedOfGains(NamedTuple):
 class AskedOfFile:
     """What was typed after `loopwright identify`, so that it can be repeated with more.
 
-    given: the values of further options, by their names; None: not given.
+    reading, given: the values of further options, by their names; None: not given. hold: that of --hold.
     """
 
     data: Path
     columns: Mapping[str, str]
-    time_format: str | None
-    resample: str | None
+    reading: Mapping[str, str | None]
+    hold: bool | None
     tune: bool
     as_json: bool
     given: Mapping[str, float | None]
@@ -50,10 +50,11 @@ class AskedOfFile:
         """The command line with further options, to copy; they replace those that were given already."""
         words = ["loopwright", "identify", str(self.data)]
         columns = {f"--{name}": column for name, column in self.columns.items()}
-        texts = {**columns, "--time-format": self.time_format, "--resample": self.resample}
+        texts: dict[str, str | None] = {**columns, **self.reading}
         texts |= {name: None if value is None else f"{value:g}" for name, value in self.given.items()}
         for name, value in texts.items():
             words += [name, value] if value is not None and name not in options else []
+        words += [] if self.hold is None else ["--hold" if self.hold else "--no-hold"]
         words += ["--tune"] * self.tune + ["--json"] * self.as_json
         return shlex.join([*words, *options])
 

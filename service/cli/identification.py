@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -65,6 +66,28 @@ def identify(
             rich_help_panel=_FILE,
         ),
     ] = None,
+    hold: Annotated[
+        bool | None,
+        typer.Option(
+            "--hold/--no-hold",
+            help="With --resample: PV holds its value until the next, as of a sensor that sends changes alone, or goes "
+            "on in a straight line. Default: as the file shows.",
+            show_default=False, rich_help_panel=_FILE,
+        ),
+    ] = None,
+    every: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME", help="The lines come every 0.1s (or 500ms, 1min): no column of the time is read.",
+            rich_help_panel=_FILE,
+        ),
+    ] = None,
+    time_unit: Annotated[
+        str | None,
+        typer.Option(
+            metavar="UNIT", help="Unit of times that are numbers: us, ms, s, min, h, d.", rich_help_panel=_FILE
+        ),
+    ] = None,
     closed_loop: Annotated[
         bool | None,
         typer.Option(
@@ -119,8 +142,9 @@ def identify(
         die("--kp takes neither --mv-before nor --plot: it answers with gains from normal operation", 2)
     check_plot(plot)
     columns = {name: column for name, column in (("t", t), ("u", u), ("y", y), ("sp", sp)) if column is not None}
-    record = _load(data, _read_options(columns, time_format, resample), as_json)
-    asked = AskedOfFile(data, columns, time_format, resample, tune, as_json, {**given, "--kp": None})
+    reading = {"--time-format": time_format, "--time-unit": time_unit, "--every": every, "--resample": resample}
+    record = _load(data, _read_options(columns, reading, hold), as_json)
+    asked = AskedOfFile(data, columns, reading, hold, tune, as_json, {**given, "--kp": None})
     if kp is not None:
         gains = (kp, ti or 0.0, td or 0.0, 1.0 if b is None else b)
         wanted = AskedOfGains(1.6 if ms is None else ms, settling_s, mv_peak)
@@ -134,14 +158,29 @@ def identify(
     _identify_test(asked, record, automatic, mv_before, plot)
 
 
-def _read_options(columns: dict[str, str], time_format: str | None, resample: str | None) -> ReadOptions:
+def _read_options(columns: dict[str, str], reading: Mapping[str, str | None], hold: bool | None) -> ReadOptions:
     from loopwright.service.offline.csv_record.record import ReadOptions
     from loopwright.service.offline.csv_record.sampling import duration
+    from loopwright.service.offline.csv_record.time_units import KNOWN, seconds_in
 
-    try:
-        return ReadOptions(columns, time_format, None if resample is None else duration(resample))
-    except ValueError as error:
-        die(f"--resample: {error}", 2)
+    times: dict[str, float | None] = {}
+    for option in ("--resample", "--every"):
+        text = reading[option]
+        try:
+            times[option] = None if text is None else duration(text)
+        except ValueError as error:
+            die(f"{option}: {error}", 2)
+    unit = reading["--time-unit"]
+    if unit is not None and seconds_in(unit) is None:
+        die(f"--time-unit: one of {KNOWN} is expected, not {unit!r}", 2)
+    if reading["--every"] is not None:
+        others = [name for name in ("--time-unit", "--time-format") if reading[name] is not None]
+        others += ["--t"] if "t" in columns else []
+        if others:
+            die(f"--every and {others[0]} exclude each other: with --every no column of the time is read", 2)
+    if hold is not None and reading["--resample"] is None:
+        die("--hold and --no-hold say how samples are made: give --resample too, such as --resample 5s", 2)
+    return ReadOptions(columns, reading["--time-format"], times["--resample"], times["--every"], unit, hold)
 
 
 def _load(data: Path, options: ReadOptions, as_json: bool) -> Record:
@@ -176,7 +215,7 @@ def _identify_test(
     from loopwright.tuning.reasons import Reason, Refused
 
     try:
-        found = fit(record.t, record.u, record.y, mv_before)
+        found = fit(record.t, record.u, record.y, record.u_before if mv_before is None else mv_before)
     except Refused as refusal:
         if automatic is not None and automatic.control.certain:
             ask_for_gains(asked, automatic)

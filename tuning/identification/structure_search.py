@@ -31,7 +31,7 @@ from loopwright.tuning.identification.structures import (
     SECOND_WITH_ZERO,
     THIRD,
 )
-from loopwright.tuning.models import TransferFunction
+from loopwright.tuning.models import Reals, TransferFunction
 from loopwright.tuning.reasons import Ended
 
 STRUCTURES = (*SEVEN, THIRD, INTEGRATOR, LAGGED_INTEGRATOR, INTEGRATOR_WITH_ZERO)
@@ -41,8 +41,18 @@ of MV; a slower one is not supported by the record."""
 MIN_MOVE = 0.2
 """Smallest change of MV, as a fraction of the largest, that counts as a move."""
 FEW_MOVES = 2
+"""Number of moves up to which a record shows a load disturbance apart from the plant's response only where the response
+is over. Moves on in the same direction, before the response is over, are one."""
 NEAR_A_MOVE = 0.02
 """Distance from a move of MV, as a fraction of the record, within which a load disturbance comes with the move."""
+SETTLED = 0.9
+"""Part of its response to a move of MV that a plant has gone through when it counts as over."""
+UNDONE = 0.5
+"""Part of a move of MV, or of MV's deviation from where it was first, from which on a load disturbance undoes it."""
+MIN_REST = 5
+"""Smallest number of samples before the first answer to MV that can show a drift."""
+DRIFT_ERRORS = 3.0
+"""Standard errors that the slope of PV before its first answer to MV must be away from 0 to show a drift."""
 LIKELIEST = 4
 """Number of the best fits to averages that are refined on every sample."""
 NEIGHBOURS = range(-2, 3)
@@ -123,21 +133,89 @@ def _within_the_record(problem: IdentificationProblem, fit: Fitted) -> bool:
 def confounded(problem: IdentificationProblem, fit: Fitted) -> bool:
     """Whether the disturbance may be confounded with the plant's own response.
 
-    It may be where MV is not needed for the fit, where a load disturbance comes with a move of MV, or where two load
-    disturbances come together. Where MV moves more than FEW_MOVES times, the record shows the plant's response apart
-    from the load disturbance.
+    It may be
+
+    - where MV is not needed for the fit, or where two load disturbances come together;
+    - where a load disturbance undoes MV's last move, or brings MV and the loads together back to where MV began: what
+      integrates may then be what settles;
+    - in a record of few moves, where a load disturbance comes before the response to the last move is over, or slows
+      down a plant that integrates: a slow part of the plant looks the same;
+    - in a record of few moves, where PV before its first answer does not show the drift.
     """
     if not problem.response_visible(fit):
         return True
     seen = np.sort(fit.theta[fit.structure.searched :])
-    near = NEAR_A_MOVE * problem.samples
-    if np.any(np.diff(seen) < near):
+    if np.any(np.diff(seen) < NEAR_A_MOVE * problem.samples):
         return True
+    if fit.hypothesis.drift:
+        return len(_turns(problem.u, 0.0)) <= FEW_MOVES and not _drifts_at_rest(problem, fit)
+    return bool(fit.hypothesis.load_disturbances) and _explains_the_response(problem, fit)
+
+
+def _explains_the_response(problem: IdentificationProblem, fit: Fitted) -> bool:
+    """Whether a load disturbance may stand for a part of the response to MV."""
+    settling, dead_time = _settling(problem, fit), float(fit.theta[fit.structure.lags])
     moves = np.flatnonzero(np.abs(np.diff(problem.u, prepend=0.0)) > MIN_MOVE)
-    if len(moves) > FEW_MOVES:
+    few = len(_turns(problem.u, settling)) <= FEW_MOVES
+    near = NEAR_A_MOVE * problem.samples
+    total = 0.0
+    for at, _, size in sorted(values.tolist() for values, _ in problem.load_disturbances(fit)):
+        seen, load = at / problem.record.Ts, size / problem.mv_unit
+        answered = min(max(math.ceil(seen - dead_time), 0), problem.samples - 1)
+        held = float(problem.u[answered])
+        before, last = held + total, 0.0
+        earlier = moves[moves <= answered]
+        if len(earlier):
+            last = float(problem.u[earlier[-1]] - problem.u[max(earlier[-1] - 1, 0)])
+        if abs(before) > MIN_MOVE and -load / before > UNDONE:
+            return True
+        if last and -load / last > UNDONE:
+            return True
+        if few:
+            if fit.structure.integrating and load * before < 0.0 and abs(before) > MIN_MOVE:
+                return True
+            if np.any((seen > moves - near) & (seen < moves + dead_time + max(near, settling))):
+                return True
+        total += load
+    return False
+
+
+def _turns(u: Reals, settling: float) -> list[int]:
+    """The samples at which MV moves, without those that go on in the same direction within `settling` samples."""
+    found: list[int] = []
+    steps = np.diff(u, prepend=0.0)
+    last = -math.inf
+    for at in np.flatnonzero(np.abs(steps) > MIN_MOVE).tolist():
+        if not (found and at - last <= settling and steps[at] * steps[found[-1]] > 0.0):
+            found.append(at)
+        last = at
+    return found
+
+
+def _settling(problem: IdentificationProblem, fit: Fitted) -> float:
+    """Samples from the first answer to a move until the response is over; of a plant that integrates, its slope."""
+    structure, theta = fit.structure, fit.theta[: fit.structure.searched].copy()
+    theta[structure.lags] = 0.0
+    answers = problem.full_fit.answers(structure, theta, np.ones((1, 1, problem.samples)))[0]
+    response = answers @ fit.linear.coefficients[: structure.inputs]
+    if structure.integrating:
+        response = np.diff(response)
+    final = problem.full_fit.static_gain(fit)
+    away = np.flatnonzero(np.abs(response - final) > (1.0 - SETTLED) * abs(final))
+    return float(away[-1] + 1) if len(away) else 0.0
+
+
+def _drifts_at_rest(problem: IdentificationProblem, fit: Fitted) -> bool:
+    """Whether PV before its first answer to MV shows the drift of the fit."""
+    rest = problem.y[: problem.record.first_move + int(fit.theta[fit.structure.lags])]
+    if len(rest) < MIN_REST:
         return False
-    after = float(fit.theta[fit.structure.lags]) + near
-    return bool(np.any((seen[:, None] > moves - near) & (seen[:, None] < moves + after)))
+    ramp = np.arange(len(rest)) - 0.5 * (len(rest) - 1)
+    slope = float(ramp @ rest / (ramp @ ramp))
+    left = rest - rest.mean() - slope * ramp
+    error = math.sqrt(float(left @ left) / (len(rest) - 2) / float(ramp @ ramp))
+    drift = 2.0 * float(fit.linear.coefficients[fit.structure.inputs + 1]) / (problem.samples - 1)
+    return slope * drift > 0.0 and abs(slope) > DRIFT_ERRORS * error and abs(slope) > 0.5 * abs(drift)
 
 
 def _period(problem: IdentificationProblem, second: Fitted) -> float:

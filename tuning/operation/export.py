@@ -10,6 +10,7 @@ import numpy as np
 
 from loopwright.tuning.models import Reals
 from loopwright.tuning.operation.history import Stretch
+from loopwright.tuning.operation.recorded_control import at_limit
 from loopwright.tuning.reasons import Reason, Refused
 
 MAX_REPEATED, MAX_STRAIGHT = 0.5, 0.5
@@ -55,6 +56,9 @@ def action_of(stretch: Stretch) -> bool:
     if part < MIN_FOLLOWED:
         text = f"OP does not follow from SP and PV by {named}: these explain {100.0 * part:.0f} % of its moves"
         raise Refused(Reason.BAD_INPUT, f"{text}. Check the gains, that the loop was in automatic, or {RAW}")
+    if (furthest := _beyond_weight(stretch, ratio)) > 1.0 / GAIN_RANGE[0]:
+        text = f"where SP steps OP moves {furthest:.2g} times as far as b {gains.b:g} asks for, and stops at its limit"
+        raise Refused(Reason.BAD_INPUT, f"{text}: give the set-point weight that was in effect")
     if best != 0 and part > followed[0][0] + CLEARLY_BETTER:
         late = "after" if best > 0 else "before"
         text = f"OP is logged {abs(best)} sample(s) {late} the PV that it answers: shift the column, or {RAW}"
@@ -82,17 +86,33 @@ def _straight(column: Reals) -> float:
 def _followed(stretch: Stretch, lag: int) -> tuple[float, float]:
     """The part of the variance of MV's moves that the controller's equation explains, where MV is logged so many
     samples late, and the ratio of the moves to those of the equation (negative for a direct action)."""
+    asked = _asked(stretch)
+    moves, limited = np.diff(stretch.mv), at_limit(stretch.mv)
+    free = ~(limited[1:] | limited[:-1])  # at a limit MV moves less than was asked for
+    first, last = max(lag, 0), min(lag, 0)
+    moves, free = moves[first : len(moves) + last], free[first : len(free) + last]
+    moves, asked = moves[free], asked[first - lag : len(asked) - lag + last][free]
+    power = float(asked @ asked)
+    if power == 0.0 or not np.any(moves):
+        return 0.0, 0.0
+    ratio = float(moves @ asked) / power
+    return ratio * float(moves @ asked) / float(moves @ moves), ratio
+
+
+def _asked(stretch: Stretch) -> Reals:
+    """The moves of MV that the controller's equation asks for, of a reverse action, MV units, shape (N - 1,)."""
     gains, Ts = stretch.gains, stretch.Ts
     error = stretch.sp - stretch.pv
     asked = gains.Kp * (np.diff(gains.b * stretch.sp - stretch.pv) + (Ts / gains.Ti if gains.Ti else 0.0) * error[:-1])
     if gains.Td:
         slope = np.diff(stretch.pv, prepend=stretch.pv[0]) / Ts
         asked = asked - gains.Kp * gains.Td * np.diff(slope)
-    moves = np.diff(stretch.mv)
-    first, last = max(lag, 0), min(lag, 0)
-    moves, asked = moves[first : len(moves) + last], asked[first - lag : len(asked) - lag + last]
-    power = float(asked @ asked)
-    if power == 0.0 or not np.any(moves):
-        return 0.0, 0.0
-    ratio = float(moves @ asked) / power
-    return ratio * float(moves @ asked) / float(moves @ moves), ratio
+    return np.asarray(asked)
+
+
+def _beyond_weight(stretch: Stretch, ratio: float) -> float:
+    """How many times as far as asked for MV moves at most where the set-point steps and MV reaches a limit."""
+    limited, moves, asked = at_limit(stretch.mv), np.diff(stretch.mv), ratio * _asked(stretch)
+    rows = np.flatnonzero(limited[1:] & ~limited[:-1] & (np.diff(stretch.sp) != 0.0))
+    same_way = np.maximum(asked[rows] * np.sign(moves[rows]), 1e-9 * np.abs(moves[rows]))
+    return float(np.max(np.abs(moves[rows]) / same_way, initial=0.0))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,6 +48,10 @@ NO_WEIGHT = 0.005
 """Set-point weight below which there is none."""
 EXACT = 1e-6
 """Part of the variance of MV's moves below which nothing is left for a derivative."""
+ROUNDING = 1e-9
+"""Distance from the prediction, as a fraction of the largest value, within which no sample is left out."""
+ENDS_OF_RANGE = (0.0, 100.0)
+"""Values of MV in % that are limits although MV was there once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +64,15 @@ class RecordedControl:
     gains: the gains that MV follows by, ISA form, Kp positive; None: not found, or there is a derivative, whose filter
     would have to be known.
     part: the part of the variance of MV's moves that they explain; 0 without them.
+    weight_at_least: the least that the set-point weight is, where MV was at a limit whenever the set-point moved, so
+    that the record does not tell it; the gains have then the larger one of this and 1.
     """
 
     certain: bool
     setpoint_moves: int | None
     gains: Gains | None
     part: float
+    weight_at_least: float | None = None
 
 
 def recorded_control(Ts: float, mv: Reals, pv: Reals, sp: Reals | None) -> RecordedControl | None:
@@ -77,15 +85,26 @@ def recorded_control(Ts: float, mv: Reals, pv: Reals, sp: Reals | None) -> Recor
     if sp is not None and _tracks(sp, pv):
         sp = None  # in manual the set-point may be made to follow PV
     moves = None if sp is None else int(np.count_nonzero(np.diff(sp)))
-    gains, part = (None, 0.0) if _is_staircase(mv) else _gains(Ts, mv, pv, sp)
+    law = _Law(None) if _is_staircase(mv) else _gains(Ts, mv, pv, sp)
     if _is_staircase(mv):
         certain = _climbs_as_controlled(mv, pv, sp)
     else:
         by_an_operator = moves is not None and 0 < moves <= MAX_MOVED * len(mv)
-        certain = by_an_operator or gains is not None or _follows(mv, pv, sp)
+        certain = by_an_operator or law.gains is not None or _follows(mv, pv, sp)
     if not certain and len(np.unique(mv)) < MANY_VALUES:
         return None
-    return RecordedControl(certain, moves, gains, part)
+    return RecordedControl(certain, moves, law.gains, law.part, law.weight_at_least)
+
+
+def at_limit(mv: Reals) -> Bools:
+    """Whether MV is at a limit at each sample: at its largest or smallest value, which it has more than once or which
+    is an end of the range in %. A controller asks for as much there, or for more."""
+    found = np.zeros(len(mv), dtype=bool)
+    for extreme in (float(np.min(mv)), float(np.max(mv))):
+        there = mv == extreme
+        if np.count_nonzero(there) > 1 or extreme in ENDS_OF_RANGE:
+            found |= there
+    return found
 
 
 def _tracks(sp: Reals, pv: Reals) -> bool:
@@ -129,7 +148,7 @@ def _fitted(columns: Reals, wanted: Reals) -> tuple[Reals, Bools]:
     found = np.linalg.lstsq(columns, wanted, rcond=None)[0]
     for _ in range(PASSES):
         distance = np.abs(wanted - columns @ found)
-        kept = distance <= np.partition(distance, stays - 1)[stays - 1]
+        kept = distance <= max(np.partition(distance, stays - 1)[stays - 1], ROUNDING * np.max(np.abs(wanted)))
         found = np.linalg.lstsq(columns[kept], wanted[kept], rcond=None)[0]
     return np.asarray(found, dtype=np.float64), kept
 
@@ -149,23 +168,44 @@ def _climbs_as_controlled(mv: Reals, pv: Reals, sp: Reals | None) -> bool:
     return left <= MAX_LEFT_OF_STAIRS and left <= MAX_LEFT_BY_INTEGRAL * without
 
 
-def _gains(Ts: float, mv: Reals, pv: Reals, sp: Reals | None) -> tuple[Gains | None, float]:
-    """The gains that MV's moves follow by, and the part of their variance that these explain; None, 0.0 without."""
+class _Law(NamedTuple):
+    """The gains that MV's moves follow by, the part of their variance that these explain, and `weight_at_least`."""
+
+    gains: Gains | None
+    part: float = 0.0
+    weight_at_least: float | None = None
+
+
+def _gains(Ts: float, mv: Reals, pv: Reals, sp: Reals | None) -> _Law:
+    """The gains that MV's moves follow by. Moves to a limit or from it are left out: they are what was left of what the
+    controller asked for, and tell only the least that the set-point weight is."""
     if sp is None:
-        return None, 0.0
-    moves, error = np.diff(mv)[1:], (sp - pv)[1:-1]
-    columns = [-np.diff(pv)[1:], Ts * error]
-    moved = np.ptp(sp) > 0.0
+        return _Law(None)
+    moves, error, limited = np.diff(mv)[1:], (sp - pv)[1:-1], at_limit(mv)
+    free = ~(limited[2:] | limited[1:-1])
+    if np.count_nonzero(free) < FEWEST:
+        return _Law(None)
+    columns, stepped = [-np.diff(pv)[1:], Ts * error], np.diff(sp)[1:]
+    moved = bool(np.any(stepped[free]))
     if moved:
-        columns.append(np.diff(sp)[1:])
-    found, part = _law(columns, moves)
-    _, with_derivative = _law([*columns, -np.diff(pv, 2)], moves)
+        columns.append(stepped)
+    found, part = _law([column[free] for column in columns], moves[free])
+    _, with_derivative = _law([column[free] for column in (*columns, -np.diff(pv, 2))], moves[free])
     derivative = 1.0 - part > EXACT and 1.0 - with_derivative < CLEARLY_LESS * (1.0 - part)
     Kp, Ki = float(found[0]), float(found[1])
     if part < MIN_PART or derivative or Kp * Ki <= 0.0:
-        return None, 0.0
-    b = float(found[2] / Kp) if moved else 1.0
-    return Gains(abs(Kp), Kp / Ki, b=0.0 if abs(b) < NO_WEIGHT else b), part
+        return _Law(None)
+    at_least = None
+    if moved:
+        b = float(found[2] / Kp)
+    elif np.any(stepped):
+        steps = np.flatnonzero(stepped)
+        asked = moves[steps] - np.column_stack(columns)[steps] @ found
+        at_least = max(float(np.max(asked / (Kp * stepped[steps]))), 0.0)
+        b = max(1.0, at_least)
+    else:
+        b = 1.0
+    return _Law(Gains(abs(Kp), Kp / Ki, b=0.0 if abs(b) < NO_WEIGHT else b), part, at_least)
 
 
 def _law(columns: list[Reals], moves: Reals) -> tuple[Reals, float]:

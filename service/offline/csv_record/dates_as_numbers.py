@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from loopwright.service.offline.csv_record.errors import Unusable
+from loopwright.service.offline.csv_record.time_units import USUAL_MINUTES
 from loopwright.tuning.models import Reals
 
 _COMPACT = re.compile(
@@ -21,8 +22,6 @@ _SHORT_STEP = 0.005
 """Largest time between samples, in days, for which numbers of that size are days in any case: seven minutes.
 
 Of a clock in s it would be 200 samples a second."""
-_USUAL_MINUTES = (10, 15, 20, 30, 60, 120, 180, 240, 360, 480, 720, 1440)
-"""Longer times between samples that are usual, min."""
 
 
 def compact_dates(cells: Sequence[str]) -> Reals | None:
@@ -58,7 +57,7 @@ def are_days(times: Reals, cells: Sequence[str], name: str) -> bool:
         return step < _SHORT_STEP
     last_digit = 10.0 ** -max(len(re.split("[.,]", f"{cell.strip()}.")[1]) for cell in cells)
     rounding = max(min(last_digit, 0.01 * step), 1e-9)  # of full doubles, too
-    days = any(abs(step - minutes / 1440.0) <= rounding for minutes in _USUAL_MINUTES)
+    days = any(abs(step - minutes / 1440.0) <= rounding for minutes in USUAL_MINUTES if minutes >= 10)
     whole_ms = abs(1000.0 * step - round(1000.0 * step)) < 1e-4
     if days == whole_ms:
         raise Unusable(

@@ -54,6 +54,7 @@ def decimal_signs(
     found: dict[str, str] = {}
     notes: list[str] = []
     problems: list[str] = []
+    doubtful: dict[str, tuple[str, str]] = {}
     for quantity, cells in columns.items():
         name = names[quantity]
         there = _first_with_sign(cells)
@@ -76,8 +77,12 @@ def decimal_signs(
             (sign, cell), *_ = there.items()
             found[quantity], note = _in_doubt(name, cells, sign, cell.strip(), delimiter)
             notes += [note] if note else []
+            doubtful[found[quantity]] = (name, cell.strip())
         else:
             found[quantity] = "."
+    if len(doubtful) == 2 and delimiter != ",":
+        written = " and ".join(f"{name} has {cell!r}" for name, cell in doubtful.values())
+        problems.append(f"{written}: one of the signs separates thousands, and no number shows which; leave it out")
     if problems:
         raise Unusable(*problems)
     return found, notes

@@ -20,10 +20,16 @@ BAD_STATES = frozenset(
 MISSING = BAD_STATES | {"", "-", "--", "?", "na", "n/a", "#n/a", "nan", "null", "none", "missing"}
 """What stands in small letters where a historian had no good value."""
 
+MINUS = "\u2212"
+"""The minus sign of typesetters, which spreadsheets write as well."""
 _THOUSANDS = {".": ",", ",": "."}
-"""The sign that separates thousands beside each decimal sign; spaces do as well."""
+"""The sign that separates thousands beside each decimal sign; spaces and apostrophes do as well."""
+_WITH_UNIT = re.compile(
+    r"^(?P<number>[+-]?[\d., \u00a0]*\d)\s?(?P<unit>[^\W\d_]{1,4}|°\s?[CF]|[^\W\d_]{1,4}/[^\W\d_]{1,3})$"
+)
+"""A number with its unit in the same cell: 61.2 degC, 4 l/min."""
 _GROUPS = {
-    decimal: re.compile(rf"(?<=\d)(?<!\d{{4}})[{sign} \u00a0\u202f](?=\d{{3}}(?!\d))|(?<=^[+-])\s+")
+    decimal: re.compile(rf"(?<=\d)(?<!\d{{4}})[{sign} \u00a0\u202f'\u2019](?=\d{{3}}(?!\d))|(?<=^[+-])\s+")
     for decimal, sign in _THOUSANDS.items()
 }
 
@@ -38,13 +44,31 @@ def number(cell: str, decimal: str) -> float | None:
     decimal: the decimal sign, "." or ","; the other one separates thousands.
     """
     thousands = _THOUSANDS[decimal]
-    text = _GROUPS[decimal].sub("", cell.strip().rstrip("%").strip())
+    text = _GROUPS[decimal].sub("", cell.strip().rstrip("%").strip().replace(MINUS, "-"))
     if not text or thousands in text or "_" in text:
         return None
     try:
         return float(text.replace(",", "."))
     except ValueError:
         return None
+
+
+def without_unit(cells: Sequence[str]) -> tuple[list[str], str] | None:
+    """Returns the cells of a column without the unit that all its numbers have behind them, and the unit; None for any
+    other column."""
+    first = next((found for cell in cells if (found := _WITH_UNIT.match(cell.strip()))), None)
+    if first is None:
+        return None
+    unit, bare = first["unit"], []
+    for cell in cells:
+        text = cell.strip()
+        if is_missing(text):
+            bare.append(cell)
+        elif (found := _WITH_UNIT.match(text)) and found["unit"] == unit:
+            bare.append(found["number"])
+        else:
+            return None
+    return bare, unit
 
 
 def is_number(cell: str) -> bool:

@@ -16,12 +16,14 @@ import numpy as np
 
 from loopwright.service.offline.csv_record.decimal_signs import decimal_signs, shown_signs
 from loopwright.service.offline.csv_record.errors import RecordError, Unusable, counted, number_of
-from loopwright.service.offline.csv_record.numbers import numbers
+from loopwright.service.offline.csv_record.numbers import numbers, without_unit
 from loopwright.service.offline.csv_record.qualities import bad_values
 from loopwright.service.offline.csv_record.sampling import sampled
 from loopwright.service.offline.csv_record.table import Table, read_table
 from loopwright.service.offline.csv_record.text import decoded
+from loopwright.service.offline.csv_record.time_units import seconds_in
 from loopwright.service.offline.csv_record.times import are_numbers, seconds
+from loopwright.service.offline.csv_record.words import TWO_STATES, plain, switched
 from loopwright.tuning.models import Reals
 
 
@@ -32,11 +34,17 @@ class ReadOptions:
     columns: the column of a quantity (t, u, y, sp), by its name or its number from 1 on.
     time_format: how times are written, as `datetime.strptime` describes it.
     resample_s: the sample time that the samples are brought to, s.
+    every_s: the time from each line to the next, s, of a file without times.
+    time_unit: the unit of times that are numbers, a word of `time_units`.
+    hold: whether PV holds its value until the next one where samples are made; None: as the record shows.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
     time_format: str | None = None
     resample_s: float | None = None
+    every_s: float | None = None
+    time_unit: str | None = None
+    hold: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +58,7 @@ class Record:
     units: the unit of u, y and sp where the file names it.
     names: the column that u, y and sp were read from; that of sp also where it was left out for want of values.
     notes: what was changed when the file was read, one sentence each.
+    u_before: MV before the first sample, where the file shows it, MV units.
     """
 
     t: Reals
@@ -59,6 +68,7 @@ class Record:
     units: Mapping[str, str] = field(default_factory=dict)
     names: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    u_before: float | None = None
 
     @property
     def without_setpoint(self) -> str:
@@ -82,7 +92,7 @@ def load_record(path: Path, options: ReadOptions = ReadOptions()) -> Record:
 def parse_record(text: str, source: str, options: ReadOptions = ReadOptions()) -> Record:
     """Returns the record in the text of a file. Raises RecordError, in which `source` names the file."""
     try:
-        return _record(read_table(text, options.columns), options)
+        return _record(read_table(text, options.columns, options.every_s is None), options)
     except Unusable as error:
         raise RecordError(source, error.problems) from None
 
@@ -93,12 +103,19 @@ def _record(table: Table, options: ReadOptions) -> Record:
     problems = list(table.problems)
     called = {quantity: names[place].strip() for quantity, place in at.items()}
     cells = {quantity: [row[place] for row in table.rows] for quantity, place in at.items()}
-    cells["t"] = _time_cells(table)
-    called["t"] = called["t"] or "the first column"
+    units, notes = dict(table.columns.units), _switched(called["u"], cells)
+    for quantity in ("u", "y", "sp"):
+        if quantity in cells and (parted := without_unit(cells[quantity])):
+            cells[quantity], units[quantity] = parted
+    if "t" in at:
+        cells["t"] = _time_cells(table)
+        if (parted := without_unit(cells["t"])) and seconds_in(parted[1]) is not None:
+            cells["t"], units["t"] = parted
+        called["t"] = called["t"] or "the first column"
     numeric = {each: cells[each] for each in cells if each != "t" or are_numbers(cells["t"], options.time_format)}
-    decimal, notes = decimal_signs(numeric, called, table.delimiter)
+    decimal, doubts = decimal_signs(numeric, called, table.delimiter)
     bad, marked = bad_values(at, names, table.rows)
-    notes += marked
+    notes += doubts + marked
     for quantity in ("u", "y", "sp"):
         if quantity in at:
             values[quantity], wrong = numbers(cells[quantity], decimal[quantity])
@@ -107,22 +124,40 @@ def _record(table: Table, options: ReadOptions) -> Record:
                 notes += _held(called[quantity], cells[quantity], values[quantity], table.lines)
             values[quantity][bad[quantity]] = np.nan
     try:
-        unit = table.columns.units.get("t", "")
-        t = seconds(cells["t"], table.lines, unit, options.time_format, called["t"], decimal.get("t", "."))
-        t = t + _milliseconds(table)
+        unit = options.time_unit or units.get("t", "")
+        t = _times(table, options, cells.get("t", []), unit, called.get("t", ""), decimal.get("t", "."))
     except Unusable as error:
         problems = [*error.problems, *problems]
     if problems:
         raise Unusable(*problems)
-    found = sampled(t, values, table.lines, options.resample_s)
+    found = sampled(t, values, table.lines, options.resample_s, options.hold)
     notes += found.notes
     if table.skipped:
         above = "line" if table.skipped == 1 else "lines"
         notes.insert(0, f"{table.skipped} {above} above the names of the columns were not used.")
     columns = found.columns
     used = {quantity: called[quantity] for quantity in values}
-    units = {quantity: unit for quantity, unit in table.columns.units.items() if quantity in values}
-    return Record(found.t, columns["u"], columns["y"], columns.get("sp"), units, used, tuple(notes))
+    units = {quantity: unit for quantity, unit in units.items() if quantity in values}
+    return Record(found.t, columns["u"], columns["y"], columns.get("sp"), units, used, tuple(notes), found.u_before)
+
+
+def _times(table: Table, options: ReadOptions, cells: list[str], unit: str, name: str, decimal: str) -> Reals:
+    """The times of the lines, s."""
+    if options.every_s is not None:
+        return np.asarray(options.every_s * np.arange(len(table.rows)), dtype=np.float64)
+    if options.time_unit is not None and not are_numbers(cells, options.time_format):
+        raise Unusable(f"--time-unit is for times that are numbers; {name} has {cells[0].strip()!r}: leave it out")
+    t = seconds(cells, table.lines, unit, options.time_format, name, decimal)
+    return t + _milliseconds(table)
+
+
+def _switched(name: str, cells: dict[str, list[str]]) -> list[str]:
+    """A note on MV that is written as on and off, whose cells become 1 and 0."""
+    found = switched(cells["u"])
+    if found is None:
+        return []
+    cells["u"], said = found
+    return [f"{name} was read as a number: {said}."]
 
 
 def _no_numbers(name: str, cells: list[str], lines: list[int], wrong: list[int]) -> list[str]:
@@ -130,7 +165,8 @@ def _no_numbers(name: str, cells: list[str], lines: list[int], wrong: list[int])
         return []
     given = cells[wrong[0]].strip()
     many = f"values of {name} are not numbers, such as {given!r}"
-    return [counted(lines, f"{name} is not a number: {given!r}", many)]
+    hint = ": write numbers, such as 1 for open and 0 for closed" if plain(given) in TWO_STATES else ""
+    return [counted(lines, f"{name} is not a number: {given!r}", many) + hint]
 
 
 def _held(name: str, cells: list[str], values: Reals, lines: Sequence[int]) -> list[str]:

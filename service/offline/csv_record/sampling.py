@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,13 @@ MAX_GAP = 3
 """Largest number of samples missing in a row that are filled."""
 MAX_FILLED = 0.05
 """Largest part of the samples that is filled."""
+MAX_TWICE = 0.02
+"""Largest part of the lines that may have the time of the line before and another MV or set-point: a move that was
+logged before and after. One such line is always permitted."""
 MAX_SAMPLES = 10_000_000
+MIN_CHANGES, MAX_REPEATED, MIN_BY_ONE = 10, 0.1, 0.3
+"""Of a sensor that sends changes alone: the smallest number of them, the largest part of the values that repeat the one
+before, and the smallest part of the changes that are of one step of its resolution."""
 _HOUR = 3600.0
 _IN_UTC = "export the times in UTC, or with their offset from it"
 _NEEDED = ("u", "y")
@@ -36,11 +42,12 @@ _SECONDS = {"ms": 1e-3, "s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.
 @dataclass(frozen=True, slots=True)
 class EvenSamples:
     """Samples in the order of their times. t: s, shape (N,). columns: the values, each of shape (N,). notes: what was
-    changed, one sentence each."""
+    changed, one sentence each. u_before: MV before the first sample, where the file shows it."""
 
     t: Reals
     columns: dict[str, Reals]
     notes: tuple[str, ...]
+    u_before: float | None = None
 
 
 def duration(text: str) -> float:
@@ -52,12 +59,14 @@ def duration(text: str) -> float:
     return value
 
 
-def sampled(t: Reals, columns: Mapping[str, Reals], lines: Sequence[int], resample_s: float | None) -> EvenSamples:
+def sampled(
+    t: Reals, columns: Mapping[str, Reals], lines: Sequence[int], resample_s: float | None, hold: bool | None = None
+) -> EvenSamples:
     """Returns the samples of a record.
 
     t: the times as they stand in the file, s, shape (N,). columns: MV `u`, PV `y` and perhaps `sp`, NaN where there is
     no value. lines: the number of the line of each sample. resample_s: the sample time asked for, s, or None for that
-    of the file. Raises Unusable.
+    of the file. hold: whether PV holds its value where samples are made; None: as the values show. Raises Unusable.
     """
     notes: list[str] = []
     order = np.arange(len(t))
@@ -67,37 +76,65 @@ def sampled(t: Reals, columns: Mapping[str, Reals], lines: Sequence[int], resamp
     t, at = t[order], np.asarray(lines, dtype=np.intp)[order]
     values = {name: column[order] for name, column in columns.items()}
     keep = _without_repeated(t, values, at, notes)
+    u_before = float(values["u"][0]) if keep[0] != 0 and np.isfinite(values["u"][0]) else None
     t, at = t[keep], at[keep]
     values = {name: column[keep] for name, column in values.items()}
     if order[0] != 0 and t[0] < 0.0:
         t = t - t[0]  # dates count from the first line
     if resample_s is not None:
-        return _resampled(t, values, resample_s, notes)
+        return replace(_resampled(t, values, resample_s, hold, notes), u_before=u_before)
     t, values = _rows_filled_in(t, values, at)
-    return _filled(t, values, notes)
+    return replace(_filled(t, values, notes), u_before=u_before)
 
 
-def _without_repeated(t: Reals, values: Mapping[str, Reals], lines: Whole, notes: list[str]) -> list[int]:
-    """The places of the samples that do not repeat the one before. Raises Unusable: times that do not increase."""
+def _without_repeated(t: Reals, values: dict[str, Reals], lines: Whole, notes: list[str]) -> list[int]:
+    """The places of the samples that do not repeat the one before. Of two samples of one time, values that one of them
+    lacks are those of the other. Raises Unusable: times that do not increase."""
     steps = np.diff(t)
     doubtful = np.flatnonzero(steps <= 0.0)
-    repeated = {
-        int(i) + 1
-        for i in doubtful
-        if steps[i] == 0.0 and all(_same(column[i], column[i + 1]) for column in values.values())
-    }
-    wrong = [int(lines[i + 1]) for i in doubtful if int(i) + 1 not in repeated]
+    repeated: set[int] = set()
+    moved: list[int] = []
+    for i in map(int, doubtful):
+        if steps[i] != 0.0:
+            continue
+        others = {name for name, column in values.items() if not _same(column[i], column[i + 1])}
+        for column in values.values():
+            one, other = float(column[i]), float(column[i + 1])
+            column[i], column[i + 1] = (other if np.isnan(one) else one), (one if np.isnan(other) else other)
+        differing = {name for name in others if not _same(values[name][i], values[name][i + 1])}
+        if not differing:
+            repeated.add(i + 1)
+        elif differing & set(_HELD) and not (i > 0 and steps[i - 1] == 0.0):
+            moved.append(i)
+    few = len(moved) <= max(1.0, MAX_TWICE * len(t))
+    left_out = {*repeated, *(moved if few else ())}
+    wrong = [int(lines[i + 1]) for i in doubtful if i not in left_out and i + 1 not in left_out]
     if wrong:
-        why = ": samples of the same time and other values; export fractions of a second, too"
-        if len(doubtful) == 1 and _is_hour(float(steps[doubtful[0]]), -_HOUR, float(np.median(steps))):
-            why = f": the clock went back by an hour there, as at the end of summer time; {_IN_UTC}"
-        elif any(steps[i] != 0.0 for i in doubtful):
-            why = ""
-        raise Unusable(counted(wrong, "the time does not increase", "times do not increase") + why)
+        raise Unusable(
+            counted(wrong, "the time does not increase", "times do not increase") + _why_not(t, steps, doubtful)
+        )
     if repeated:
         lines_left_out = number_of(len(repeated), "line that repeats", "lines that repeat")
         notes.append(f"{lines_left_out} the one before {_were(len(repeated))} left out.")
-    return [i for i in range(len(t)) if i not in repeated]
+    for i in moved:
+        notes.append(
+            f"Line {lines[i]} was left out: line {lines[i + 1]} has the same time, and its values hold from then on."
+            + (f" MV before the record is {values['u'][0]:g}." if i == 0 else "")
+        )
+    return [i for i in range(len(t)) if i not in left_out]
+
+
+def _why_not(t: Reals, steps: Reals, doubtful: NDArray[np.intp]) -> str:
+    """Why times do not increase, and what to do."""
+    if len(doubtful) == 1 and _is_hour(float(steps[doubtful[0]]), -_HOUR, float(np.median(steps))):
+        return f": the clock went back by an hour there, as at the end of summer time; {_IN_UTC}"
+    if any(steps[i] != 0.0 for i in doubtful):
+        return ""
+    together = len(t) / (len(t) - len(doubtful))
+    every = float(t[-1] - t[0]) / max(len(t) - round(together), 1)
+    return ": samples of the same time and other values; export fractions of a second, too" + (
+        f", or, if the lines come evenly, --every {_round(every):g}s in place of the times" if every > 0.0 else ""
+    )
 
 
 def _is_hour(step: float, change: float, usual: float) -> bool:
@@ -205,13 +242,16 @@ def _without_late_setpoint(t: Reals, values: Mapping[str, Reals], notes: list[st
     return {name: values[name] for name in _NEEDED}
 
 
-def _resampled(t: Reals, values: Mapping[str, Reals], Ts: float, notes: list[str]) -> EvenSamples:
+def _resampled(t: Reals, values: Mapping[str, Reals], Ts: float, hold: bool | None, notes: list[str]) -> EvenSamples:
     values = _without_late_setpoint(t, values, notes)
     there = {name: t[~np.isnan(column)] for name, column in values.items()}
     if any(len(each) < 2 for each in there.values()):
         raise Unusable("a column has fewer than two values: there is nothing to resample")
+    resolution = _resolution_of_changes(t, values["y"])
+    held = resolution is not None if hold is None else hold
     start = max(float(each[0]) for each in there.values())
-    stop = float(there["y"][-1])  # nothing is known of PV after its last value
+    # of what is not held nothing is known after its last value
+    stop = float(t[-1] if held else there["y"][-1])
     if stop <= start:
         raise Unusable(
             f"PV has its last value at {stop:.6g} s, and a column its first one only at {start:.6g} s: there is "
@@ -222,22 +262,44 @@ def _resampled(t: Reals, values: Mapping[str, Reals], Ts: float, notes: list[str
         raise Unusable(f"--resample would make {count} samples; at most {MAX_SAMPLES} are possible: ask for fewer")
     grid: Reals = np.asarray(start + Ts * np.arange(count), dtype=np.float64)
     columns = {
-        name: _held_means(grid, t, column) if name in _HELD else _interpolated(grid, t, column, held=False)
+        name: _held_means(grid, t, column) if name in _HELD else _interpolated(grid, t, column, held)
         for name, column in values.items()
     }
     times = there["y"]
     longest = float(np.max(np.diff(times)))
     usual = float(np.median(np.diff(times)))
+    how = "PV, MV and set-point held" if held else "PV in a straight line, MV and set-point held"
     notes.append(
         f"The samples were made every {Ts:g} s from values of PV every {usual:.3g} s, at most {longest:.3g} s apart: "
-        "PV in a straight line, MV and set-point held. A move of MV is taken as made at the time of the line that "
+        f"{how}. A move of MV is taken as made at the time of the line that "
         "shows it first; the dead time comes out short by as much as the line was late."
     )
+    if resolution is not None and hold is None:
+        notes.append(
+            f"PV changes by {resolution:g} and is not repeated, as where a sensor sends changes alone: it was held. "
+            "--no-hold draws straight lines."
+        )
     if _is_hour(longest, _HOUR, usual):
         notes.append(f"PV has no value for an hour. If it is the one left out as summer time begins, {_IN_UTC}.")
-    if longest > 5.0 * Ts:
+    if longest > 5.0 * Ts and not held:
         notes.append("Where PV is far between, the record shows straight lines, and the fit knows less than it says.")
     return EvenSamples(grid - grid[0], columns, tuple(notes))
+
+
+def _resolution_of_changes(t: Reals, column: Reals) -> float | None:
+    """The step in which a sensor changes that sends nothing but changes, at uneven times; None for any other column."""
+    there = ~np.isnan(column)
+    moves, intervals = np.abs(np.diff(column[there])), np.diff(t[there])
+    changes = moves[moves > 0.0]
+    if len(changes) < MIN_CHANGES or len(moves) - len(changes) > MAX_REPEATED * len(moves):
+        return None
+    step = float(np.min(changes))
+    steps = changes / step
+    even = np.mean(np.abs(intervals - np.median(intervals)) <= UNEVEN * np.median(intervals)) > 0.9
+    whole = np.all(np.abs(steps - np.rint(steps)) < 0.01)
+    if even or not whole or float(np.mean(steps < 1.5)) < MIN_BY_ONE:
+        return None
+    return _round(step)
 
 
 def _held_means(grid: Reals, t: Reals, column: Reals) -> Reals:

@@ -13,6 +13,18 @@ _MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16-le"),
     (codecs.BOM_UTF16_BE, "utf-16-be"),
 )
+_OTHERS = (
+    (b"PK\x03\x04", "a workbook or another archive"),
+    (b"\xd0\xcf\x11\xe0", "an old workbook"),
+    (b"%PDF", "a PDF"),
+    (b"\x1f\x8b", "compressed"),
+    (b"SQLite format 3", "a database"),
+    (b"PAR1", "a Parquet file"),
+    (b"MATLAB 5", "a file of MATLAB"),
+    (b"\x89HDF", "an HDF5 file"),
+    (b"TDSm", "a TDMS file"),
+)
+"""How files begin that are no text."""
 _START = 4096
 """Bytes at the start that tell UTF-16 without a mark: every second one of them is then 0."""
 
@@ -20,6 +32,9 @@ _START = 4096
 def decoded(content: bytes) -> str:
     """Returns the text of a file: UTF-8, UTF-16, UTF-32, or Windows' western code page, in which old loggers write
     their degree signs. Raises Unusable for what is no text."""
+    for mark, named in _OTHERS:
+        if content.startswith(mark):
+            raise Unusable(f"is not a table of measurements as text: it is {named}. Save the sheet or the trend as CSV")
     for mark, encoding in _MARKS:
         if content.startswith(mark):
             return _text(content[len(mark) :], encoding)

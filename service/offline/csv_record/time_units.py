@@ -1,25 +1,41 @@
-"""The units of times that are numbers, by the words that people have for them."""
+"""The units of times that are numbers, by the words that people have for them in English, German, French, Spanish."""
 
 from __future__ import annotations
 
 import re
 
+import numpy as np
+
 from loopwright.service.offline.csv_record.errors import Unusable
+from loopwright.service.offline.csv_record.words import plain
+from loopwright.tuning.models import Reals
 
 _WORDS = {
     1e-9: ("ns", "nsec", "nanosecond", "nanoseconds"),
     1e-6: ("us", "usec", "\u03bcs", "\u03bcsec", "microsecond", "microseconds"),
-    1e-3: ("ms", "msec", "msecs", "millisecond", "milliseconds"),
-    1.0: ("s", "sec", "secs", "second", "seconds"),
-    60.0: ("min", "mins", "minute", "minutes"),
-    3600.0: ("h", "hr", "hrs", "hour", "hours"),
-    86400.0: ("d", "day", "days"),
-}
+    1e-3: (
+        "ms", "msec", "msecs", "millis", "millisecond", "milliseconds", "millisekunde", "millisekunden",
+        "milliseconde", "millisecondes", "milisegundo", "milisegundos",
+    ),
+    1.0: (
+        "s", "sec", "secs", "second", "seconds", "sek", "sekunde", "sekunden", "seconde", "secondes", "seg", "segundo",
+        "segundos",
+    ),
+    60.0: ("min", "mins", "minute", "minutes", "minuten", "minuto", "minutos"),
+    3600.0: ("h", "hr", "hrs", "hour", "hours", "std", "stunde", "stunden", "heure", "heures", "hora", "horas"),
+    86400.0: ("d", "day", "days", "tag", "tage", "jour", "jours", "dia", "dias"),
+}  # fmt: skip
 SECONDS = {word: s for s, words in _WORDS.items() for word in words}
 """The seconds in a unit, by each word for it."""
-_KNOWN = "ns, us, ms, s, min, h and d"
+KNOWN = "ns, us, ms, s, min, h and d"
+"""The units, for sentences."""
 _NO_UNIT = re.compile(r"^(?:|utc|gmt|z|local|local time|(?:utc|gmt)?\s?[+-]\d{1,2}(?::?\d{2})?)$")
 """What stands in brackets behind the name of a time, and says nothing of its unit."""
+USUAL_MINUTES = (2, 3, 5, 10, 15, 20, 30, 60, 120, 180, 240, 360, 480, 720, 1440)
+"""Times between samples that are usual where they are longer than a minute, min."""
+_SELDOM, _DAY = 100.0, 86400.0
+"""Time between samples from which on they are seldom logged in anything but whole minutes, and a day, s."""
+_WEEK = 7.0 * _DAY
 _LATEST = 1e11
 """Seconds of three thousand years, beyond which a time has another unit than its column says."""
 
@@ -47,10 +63,23 @@ def require_possible(first_s: float, unit: str, name: str) -> None:
         raise Unusable(f"{name} begins at {first_s:.4g} s, more than 3000 years, in the unit {unit!r}; {_put(name)}")
 
 
+def require_s_likely(times: Reals, name: str) -> None:
+    """Raises Unusable for times that no unit is said of and that are unlikely to be s: 0, 500, 1000."""
+    steps = np.abs(np.diff(times))
+    usual, length = (float(np.median(steps)), float(np.ptp(times))) if len(steps) else (0.0, 0.0)
+    whole_minutes = any(abs(usual - 60.0 * minutes) < 0.01 * usual for minutes in USUAL_MINUTES)
+    if length > _WEEK or (usual >= _SELDOM and not whole_minutes):
+        shown = f"{length / _DAY:.3g} d" if length > _DAY else f"{length / 3600.0:.3g} h"
+        raise Unusable(
+            f"{name} has no unit; as s its values come every {usual:.4g} s, {shown} in all. Say which unit it is: "
+            f"--time-unit ms, or --time-unit s if that is so ({KNOWN})"
+        )
+
+
 def _put(name: str) -> str:
     bare = re.split(r"\s*[(\[{]", name)[0] or name
-    return f"put one of {_KNOWN} in its place, as in '{bare} (min)'"
+    return f"put one of {KNOWN} in its place, as in '{bare} (min)'"
 
 
 def _word(text: str) -> str:
-    return text.casefold().replace(".", "").strip()
+    return plain(text.replace(".", ""))

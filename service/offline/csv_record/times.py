@@ -18,14 +18,26 @@ import numpy as np
 from loopwright.service.offline.csv_record.dates_as_numbers import are_days, compact_dates
 from loopwright.service.offline.csv_record.errors import Unusable, counted
 from loopwright.service.offline.csv_record.numbers import numbers
-from loopwright.service.offline.csv_record.time_units import require_known, require_possible, seconds_in
+from loopwright.service.offline.csv_record.time_units import (
+    require_known,
+    require_possible,
+    require_s_likely,
+    seconds_in,
+)
+from loopwright.service.offline.csv_record.words import plain
 from loopwright.tuning.models import Reals
 
 _EPOCHS = ((1e18, 1e-9), (1e17, 1e-7), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))
 """Times from so large a number on count from an epoch, in units of so many s: ns, Windows' 100 ns, us, ms, s."""
-_MONTHS = {name.lower(): i for i, name in enumerate(month_abbr) if name}
+_MONTHS = {
+    **{name.lower(): i for i, name in enumerate(month_abbr) if name},
+    **{"mrz": 3, "mai": 5, "okt": 10, "dez": 12},
+    **{"fev": 2, "avr": 4, "juin": 6, "juil": 7, "aou": 8},
+    **{"ene": 1, "abr": 4, "ago": 8, "dic": 12},
+}
+"""The number of a month by the first letters of its name in English, German, French and Spanish, without accents."""
 _MOMENT = re.compile(
-    r"^(?:(?P<a>\d{1,4})(?P<sign>[./\- ])(?P<b>\d{1,2}|[A-Za-z]{3,9})[./\- ](?P<c>\d{2,4})(?:[T, ]\s*|$))?"
+    r"^(?:(?P<a>\d{1,4})(?P<sign>\.\s?|[/\- ])(?P<b>\d{1,2}|[^\W\d_]{3,10}\.?)[./\- ](?P<c>\d{2,4})(?:[T, ]\s*|$))?"
     r"(?:(?P<hour>\d{1,2}):(?P<minute>\d{2})(?::(?P<second>\d{2})(?:[.,:](?P<fraction>\d{1,9}))?)?"
     r"\s*(?P<half>[AaPp]\.?\s?[Mm]\.?)?)?(?:\s*(?:UTC|GMT|Z))?$"
 )
@@ -126,6 +138,7 @@ def _of_numbers(cells: Sequence[str], lines: Sequence[int], unit: str, name: str
     if are_days(times, cells, name):
         return _from_first(times) * _DAY
     require_known(unit, name)
+    require_s_likely(times, name)
     return times
 
 
@@ -173,13 +186,13 @@ def _days(dates: set[tuple[str, str, str, str]], order: str) -> dict[tuple[str, 
         year_first = len(first) == 4
         fits = {
             "day": not year_first,
-            "month": not year_first and sign != ".",
+            "month": not year_first and not sign.startswith("."),
             "year": year_first or len(first) == len(third) == 2,
         }
         if not fits[order]:
             return None
         try:
-            month = _MONTHS.get(second[:3].lower())
+            month = _MONTHS.get(plain(second)[:4]) or _MONTHS.get(plain(second)[:3])
             match order:
                 case "year":
                     day = datetime(_year(first), month or int(second), int(third))

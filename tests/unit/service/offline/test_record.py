@@ -129,7 +129,10 @@ def test_times_that_do_not_increase() -> None:
         ("t,u,y\n", "no samples"),
         ("t,u\n0,1\n", "process variable, ...); there are: t, u. Say which: --y NAME"),
         ("0,1,2\n1,1,2\n", "no column for the time: the line has no names. Give its number, as --t 1"),
-        ("t,time,u,y\n0,0,1,2\n", "more than one column for the time: t, time. Say which: --t NAME"),
+        (
+            "t,time,u,y\n0,0,1,2\n",
+            "more than one column for the time: t (column 1) or time (column 2). Say which: --t NAME",
+        ),
         ("t,u,y\n2024-05-01T00:00:00,1,2\n5,1,2\n", "line 3: t is no time that is known; --time-format says"),
         ("t,u,y\n0,1,2\n2024-05-01T00:00:00,1,2\n", "neither a number of s nor a date and time: '2024-05-01T00:00:00'"),
     ],
@@ -148,7 +151,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(RecordError, match="not text in UTF-16-LE: byte 0"):
         load_record(binary)
     binary.write_bytes(b"PK\x03\x04\x14\x00\x06\x00\x08\x00sheet")
-    with pytest.raises(RecordError, match=r"is not text: byte 5 is 0\. Export it as CSV"):
+    with pytest.raises(RecordError, match=r"it is a workbook or another archive\. Save the sheet"):
         load_record(binary)
 
 
