@@ -26,7 +26,7 @@ class LoopModel:
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """How far PV goes from where it rests, PV units; down and up are positive.
+    """How far PV goes from where it rests, its noise included, PV units; down and up are positive.
 
     down, up: at most, with the uncertainty of the model.
     likely_down, likely_up: on the model itself.
@@ -49,7 +49,15 @@ class Expected:
 
     source: the model that tells it, in words; empty where nothing does.
     stages: how far PV goes in each stage; a stage that is not in it is one of which that is not known.
+    begins_with_pct: the amplitude with which the relay begins so that PV keeps its limits, percent; None where it may
+    begin with its own.
+    broken: a sentence with the numbers for each limit of PV that the test is expected to break all the same.
     """
 
     source: str = ""
     stages: Mapping[str, Reach] = field(default_factory=dict)
+    begins_with_pct: float | None = None
+    broken: tuple[str, ...] = ()
+
+
+NOTHING_EXPECTED = Expected()
