@@ -49,12 +49,14 @@ NOISES = 3.0
 """Standard deviations of its noise by which PV is beyond where the plant is."""
 MARGIN, MARGIN_UNKNOWN = 0.03, 0.1
 """What is added to the way of PV, as a part of it: of a model with a covariance, and of one without."""
+ROUGH = 2.0
+"""Factor within which the way of PV is known by a rough model."""
 SIZED_TO, MAX_SIZED = 0.95, 4
 """Part of PV's limits to which the relay's first wave is sized, and in how many steps."""
 SEVERAL_TIMES = 2.0
 """Where PV stays within its limits even on so many times its likely way, the uncertainty of the model is not asked."""
-Ranges = Mapping[str, tuple[float, float]]
-"""The lowest and the highest PV of each stage, from rest, PV units."""
+STILL = ("preflight", "settle", "design", "redesign", "estimate", "optimise")
+"""Stages that move nothing."""
 
 
 def excursions(config: LoopConfig, request: RetuneRequest, state: LoopState, known: LoopModel) -> Expected:
@@ -121,14 +123,17 @@ def _within_limits(asked: _Asked, unit: str) -> Expected:
     adapted = isinstance(asked.request, FastRetune) and asked.request.amplitude_pct is None
     if relay is not None and adapted and _share(relay, facts) > 1.0:
         amplitude = FIRST_AMPLITUDE * max_amplitude(0.0, facts.mv_low, facts.mv_high, facts.mv_step_max)
-        smallest = max(MIN_AMPLITUDE_PCT, amplitude * MIN_OUTPUT_RANGE * asked.noise / (relay.down + relay.up))
+        least = MIN_OUTPUT_RANGE * asked.noise / (relay.down + relay.up)
+        smallest = max(MIN_AMPLITUDE_PCT, amplitude * least)
         for _ in range(MAX_SIZED):
             amplitude = begins_with = max(smallest, SIZED_TO * amplitude / _share(stages["relay"], facts))
             stages = _stages(replace(asked, begins_with=amplitude))
             if amplitude == smallest or "relay" not in stages or _share(stages["relay"], facts) <= 1.0:
                 break
-    broken = [_sentence(asked, stage, reach, unit) for stage, reach in stages.items() if _breaks(reach, facts)]
-    return Expected(asked.known.source, stages, begins_with, tuple(broken))
+    moving = {stage: reach for stage, reach in stages.items() if stage not in STILL}
+    first = next((stage for stage, reach in moving.items() if _breaks(asked, reach)), None)
+    broken = () if first is None else (_sentence(asked, first, moving, unit),)
+    return Expected(asked.known.source, stages, begins_with, broken)
 
 
 def _share(reach: Reach, facts: Facts) -> float:
@@ -137,19 +142,22 @@ def _share(reach: Reach, facts: Facts) -> float:
     return max(gone / room if room > 0.0 else math.inf for gone, room in sides if gone > 0.0)
 
 
-def _breaks(reach: Reach, facts: Facts) -> bool:
+def _breaks(asked: _Asked, reach: Reach) -> bool:
     """Whether PV goes beyond its limits on the model itself: where it may only do so, the test is worth while."""
-    return reach.likely_up > facts.pv_high or -reach.likely_down < facts.pv_low
+    least = 1.0 / ROUGH if asked.known.rough else 1.0
+    return least * reach.likely_up > asked.facts.pv_high or -least * reach.likely_down < asked.facts.pv_low
 
 
-def _sentence(asked: _Asked, stage: str, reach: Reach, unit: str) -> str:
-    config, facts, rest = asked.config, asked.facts, asked.rest
+def _sentence(asked: _Asked, stage: str, stages: Mapping[str, Reach], unit: str) -> str:
+    """What is wrong with a stage, and what would do for all of them."""
+    config, facts, rest, reach = asked.config, asked.facts, asked.rest, stages[stage]
     low, high = config.pv_limits.low, config.pv_limits.high
     text = (
         f"PV is expected between {rest - reach.likely_down:.5g} and {rest + reach.likely_up:.5g} {unit} in stage "
         f"{stage}, by {asked.known.source}: that is beyond its limits {low:g} .. {high:g}"
     )
-    limits = f"PV limits of {rest - reach.down:.5g} .. {rest + reach.up:.5g}"
+    down, up = (max(getattr(each, side) for each in stages.values()) for side in ("down", "up"))
+    limits = f"PV limits of {min(low, rest - down):.5g} .. {max(high, rest + up):.5g}"
     share = max(reach.likely_up / facts.pv_high, reach.likely_down / -facts.pv_low) if facts.pv_low < 0.0 else math.inf
     given = asked.request.amplitude_pct if isinstance(asked.request, FastRetune) else None
     if stage != "relay":
@@ -167,7 +175,7 @@ def _stages(asked: _Asked) -> dict[str, Reach]:
     errors."""
     likely = _ranges(asked, asked.known.model)
     others = [_ranges(asked, each) for each in _neighbours(asked.known)]
-    margin = 1.0 + (MARGIN_UNKNOWN if asked.known.covariance is None else MARGIN)
+    margin = ROUGH if asked.known.rough else 1.0 + (MARGIN_UNKNOWN if asked.known.covariance is None else MARGIN)
     noises, found = NOISES * asked.noise, {}
     for stage, (low, high) in likely.items():
         axes = [[each[stage] for each in pair if stage in each] for pair in zip(others[::2], others[1::2], strict=True)]

@@ -19,6 +19,7 @@ from loopwright.tuning.experiments.preflight import PREFLIGHT
 from loopwright.tuning.fast.manual_procedure import MANUAL
 from loopwright.tuning.fast.pulse_levels import RESTED, candidate_models
 from loopwright.tuning.gains import Gains
+from loopwright.tuning.identification.structures import INTEGRATOR
 from loopwright.tuning.models import Model
 from loopwright.tuning.plan import Sample
 from loopwright.tuning.reasons import Reason, Refused
@@ -55,7 +56,8 @@ def loop_model(
         if found is not None:
             return LoopModel(found, f"the model that job {row.id} found", None, noise)
         if row.reason is Reason.PV_LIMIT and (read_off := _of_record(store, row)) is not None:
-            return LoopModel(read_off, f"the record of job {row.id}, which ended as PV left its limits", None, noise)
+            words = f"the record of job {row.id}, which ended as PV left its limits"
+            return LoopModel(read_off, words, None, noise, rough=True)
     return None
 
 
@@ -70,7 +72,7 @@ def _noise(store: Store, rows: Sequence[Job]) -> float | None:
 
 
 def _of_record(store: Store, row: Job) -> Model | None:
-    """The model of lags that explains the samples of a job best; None where there is none of the right sign."""
+    """The model that the samples of a job tell; None where they tell none."""
     blocks = store.samples(row.id)
     first = next((k for k, (stage, _) in enumerate(blocks) if stage in MOVING), None)
     if first is None or row.found is None:
@@ -81,7 +83,8 @@ def _of_record(store: Store, row: Job) -> Model | None:
 
 
 def model_of_samples(rest: Sequence[Sample], moved: Sequence[Sample], reverse: bool) -> Model | None:
-    """The model of lags that explains samples best; None where there is none of the right sign.
+    """The dead time and the slope that explain samples best; None where there are none of the right sign. So short a
+    record tells no more, and a plant with a lag goes no further.
 
     rest, moved: the samples before MV or the set-point was moved, and since. reverse: the controller's action.
     """
@@ -92,7 +95,7 @@ def model_of_samples(rest: Sequence[Sample], moved: Sequence[Sample], reverse: b
     u = np.where(at_rest, 0.0, mv - float(np.mean(mv[at_rest])))
     y = pv - float(np.mean(pv[at_rest]))
     try:
-        found = candidate_models(u, y, float(np.median(np.diff(t))), 1.0 if reverse else -1.0)
+        found = candidate_models(u, y, float(np.median(np.diff(t))), 1.0 if reverse else -1.0, (INTEGRATOR,))
     except Refused:
         return None
     return found[0] if found else None

@@ -16,12 +16,14 @@ class LoopModel:
     source: where it comes from, in words.
     covariance: of num, of den without its leading 1 and of the dead time, in this order; None where it is not known.
     noise: the standard deviation of PV's noise, PV units; None where it is not known.
+    rough: whether its gain is known to a factor of two alone.
     """
 
     model: Model
     source: str
     covariance: tuple[tuple[float, ...], ...] | None = None
     noise: float | None = None
+    rough: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from loopwright.tuning.identification.disturbances import by_bic
 from loopwright.tuning.identification.output_error import UNDISTURBED
 from loopwright.tuning.identification.problem import IdentificationProblem
 from loopwright.tuning.identification.record import recorded_test
-from loopwright.tuning.identification.structures import FIRST, INTEGRATOR, LAGGED_INTEGRATOR, SECOND
+from loopwright.tuning.identification.structures import FIRST, INTEGRATOR, LAGGED_INTEGRATOR, SECOND, Structure
 from loopwright.tuning.models import Model, Reals, sign
 from loopwright.tuning.reasons import Refused
 
@@ -58,7 +58,9 @@ class PulseBounds:
     noise: float
 
 
-def candidate_models(u: Reals, y: Reals, Ts: float, action: float) -> list[Model]:
+def candidate_models(
+    u: Reals, y: Reals, Ts: float, action: float, structures: Sequence[Structure] = STRUCTURES
+) -> list[Model]:
     """The models of lags that explain a record about as well as the best one, the best one first.
 
     u, y: MV and PV as deviations from rest, shape (N,). Ts: the sample time, s.
@@ -66,7 +68,7 @@ def candidate_models(u: Reals, y: Reals, Ts: float, action: float) -> list[Model
     Raises Refused as `recorded_test`.
     """
     problem = IdentificationProblem(recorded_test(Ts * np.arange(len(u)), u, y, 0.0))
-    ranked = sorted((problem.fit(structure, UNDISTURBED) for structure in STRUCTURES), key=by_bic)
+    ranked = sorted((problem.fit(structure, UNDISTURBED) for structure in structures), key=by_bic)
     found = [(fit.bic, problem.model(fit)) for fit in ranked]
     right = [(bic, model) for bic, model in found if sign(model) == action]
     return [model for bic, model in right if bic <= right[0][0] + CLOSE_BIC]
