@@ -384,7 +384,7 @@ def create_app(
     live = live or Live(jobs, listening, alarms, others)
     add(app, gateways.router(jobs.directory, own, others))
     add(app, live_api.router(live, jobs.directory, keyring, policy.sessions))
-    add(app, previews.router(jobs, many))
+    add(app, previews.router(jobs, many, pool))
     add(app, tunings.router(jobs, pool))
     figures = figures or KeptFigures(jobs.store, pool)
     add(app, job_figures.router(jobs, figures))

@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Path
 
 from loopwright.service.api import problems
 from loopwright.service.api.routes import new_router
-from loopwright.service.inputs.request import FastRetune, RetuneRequest
+from loopwright.service.execution.computing.limits import ComputationKind
+from loopwright.service.execution.computing.pool import NotWanted, Pool
+from loopwright.service.execution.procedures import expected
+from loopwright.service.inputs.config import LoopConfig
+from loopwright.service.inputs.request import FastRetune, RetuneRequest, narrow
 from loopwright.service.jobs.fleet import Fleet, FleetRequest
+from loopwright.service.jobs.loop_model import loop_model
 from loopwright.service.jobs.manager import Jobs
+from loopwright.service.planning.expected import NOTHING_EXPECTED, Expected
 from loopwright.service.planning.obstacles import Now
 from loopwright.service.planning.preview import FleetPreview, LastProposal, Preview, fleet_preview, preview
 from loopwright.service.states.loop_state import loop_state
 from loopwright.service.store import loop_locks
 from loopwright.service.store.jobs import Job
-from loopwright.tuning.reasons import Ended
+from loopwright.tuning.reasons import Ended, Failed
+
+log = logging.getLogger(__name__)
 
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 
 
-def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
-    """A router with POST /loops/{tag}/retune/preview and POST /retunes/preview."""
+def router(jobs: Jobs, fleet: Fleet, pool: Pool) -> APIRouter:
+    """A router with POST /loops/{tag}/retune/preview and POST /retunes/preview. pool: computes how far PV goes."""
     routes = new_router()
 
     @routes.post(
@@ -37,7 +47,8 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
         config, _ = jobs.directory.owner(tag)
         now = _now(jobs, tag, request)
         known = jobs.knowledge.of(tag, None if now.state is None else now.state.gains)
-        return preview(config, request, now, _last(jobs.store.last_models(tag).get(tag)), known)
+        told = _expected(jobs, pool, config, request, now)
+        return preview(config, request, now, _last(jobs.store.last_models(tag).get(tag)), known, told)
 
     @routes.post(
         "/retunes/preview",
@@ -59,6 +70,22 @@ def router(jobs: Jobs, fleet: Fleet) -> APIRouter:
         ])  # fmt: skip
 
     return routes
+
+
+def _expected(jobs: Jobs, pool: Pool, config: LoopConfig, request: RetuneRequest, now: Now) -> Expected:
+    """How far PV is expected to go; nothing where no model is known, or no process is to be had for it."""
+    state, (narrowed, problems) = now.state, narrow(config, request)
+    if state is None or problems or request.dry_run:
+        return NOTHING_EXPECTED
+    known = loop_model(jobs.store, jobs.knowledge, config, request, state.gains)
+    if known is None:
+        return NOTHING_EXPECTED
+    try:
+        work = partial(expected, narrowed, request, state, known)
+        return pool.run(ComputationKind.TUNING, work, unwanted=lambda: jobs.stopping)
+    except (Failed, NotWanted) as failed:
+        log.warning("how far PV of %s would go could not be computed: %s", config.tag, failed)
+        return NOTHING_EXPECTED
 
 
 def _now(jobs: Jobs, tag: str, request: RetuneRequest) -> Now:

@@ -27,12 +27,13 @@ def _stages(found: Preview, console: Console) -> None:
     moving = [each for each in found.stages if each.mv_move_pct or each.sp_move]
     if not moving:
         return
-    table = Table("stage", "MV %", "SP", "plant time", "what is moved")
+    table = Table("stage", "MV %", "SP", "PV", "plant time", "what is moved")
     for each in moving:
         table.add_row(
             each.stage,
             _range(each.mv_low_pct, each.mv_high_pct, each.mv_move_pct),
             _range(each.sp_low, each.sp_high, each.sp_move),
+            "not known" if each.pv_move is None else _range(each.pv_low, each.pv_high, each.pv_move),
             duration_text(each.duration_low_s, each.duration_high_s),
             each.what,
         )

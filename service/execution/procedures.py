@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
+from loopwright.service.execution.computing.limits import ComputationKind
+from loopwright.service.execution.computing.pool import NotWanted
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import (
     FastRetune,
@@ -16,6 +19,7 @@ from loopwright.service.inputs.request import (
     wrong_mode,
 )
 from loopwright.service.loops.loop import Loop
+from loopwright.service.planning.expected import NOTHING_EXPECTED, Expected, LoopModel
 from loopwright.service.planning.facts import facts_of, time_budget_s
 from loopwright.service.planning.ground import Ground, rehearsal_spec
 from loopwright.service.planning.moves import broken_from
@@ -28,7 +32,7 @@ from loopwright.tuning.fast.excitation_choice import NOT_ASKED
 from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.models import Model
 from loopwright.tuning.plan import Event, Mode, Note, Plan, Sample
-from loopwright.tuning.reasons import Ended, NoGain, Reason, Refused
+from loopwright.tuning.reasons import Ended, Failed, NoGain, Reason, Refused
 
 if TYPE_CHECKING:
     from loopwright.service.execution.beside import Workers
@@ -48,6 +52,7 @@ class Hooks:
     on_home: receives the state of the loop before the test.
     ground: known facts of the loop, for a rehearsal.
     plant: what operation has shown of the plant.
+    model: the model that tells how far PV will go.
     """
 
     on_event: Callable[[Event], None]
@@ -58,6 +63,7 @@ class Hooks:
     on_home: Callable[[LoopState], None] = lambda home: None
     ground: Ground = field(default_factory=Ground)
     plant: ObservedPlant | NothingKnown = NOT_ASKED
+    model: LoopModel | None = None
 
 
 @dataclass(frozen=True)
@@ -113,8 +119,12 @@ def tune(
     if wrong is not None:
         raise Refused(Reason.WRONG_MODE, wrong)
     broken = broken_from(config, request, state)
-    if broken:
-        raise Refused(Reason.BAD_LIMITS, "; ".join(broken))
+    told = NOTHING_EXPECTED if broken else _expected_of(config, request, state, hooks, workers)
+    if broken or told.broken:
+        raise Refused(Reason.BAD_LIMITS, "; ".join((*broken, *told.broken)))
+    if (begins_with := told.begins_with_pct) is not None:
+        text = f"the relay begins with {begins_with:.3g} %, so that PV keeps its limits, by {told.source}"
+        hooks.on_event(Note(text))
     limits = RunLimits(
         pv_low=config.pv_limits.low,
         pv_high=config.pv_limits.high,
@@ -125,7 +135,7 @@ def tune(
     )
     computing = ComputingLoop(loop, workers)
     ran = run(
-        plan(config, request, facts, hooks.earlier, hooks.plant, state.mode),
+        plan(config, request, facts, hooks.earlier, hooks.plant, state.mode, begins_with),
         computing,
         limits=limits,
         on_event=hooks.on_event,
@@ -141,6 +151,35 @@ def tune(
     return Outcome(None if ran.value is None else result_of(ran.value), ended, ran.restored, dict(ran.plant_time_s))
 
 
+def _expected_of(
+    config: LoopConfig, request: RetuneRequest, state: LoopState, hooks: Hooks, workers: Workers | None
+) -> Expected:
+    """How far PV is expected to go, where it may come near its limits; nothing where that cannot be computed."""
+    if hooks.model is None:
+        return NOTHING_EXPECTED
+    work = partial(expected, config, request, state, hooks.model, near_limits_alone=True)
+    if workers is None:
+        return work()
+    try:
+        return workers.submit(ComputationKind.LIVE, work, lambda: hooks.stop() is not None).result()
+    except (Failed, NotWanted) as failed:
+        hooks.on_event(Note(f"how far PV would go could not be computed: {failed}"))
+        return NOTHING_EXPECTED
+
+
+def expected(
+    config: LoopConfig, request: RetuneRequest, state: LoopState, known: LoopModel, near_limits_alone: bool = False
+) -> Expected:
+    """How far PV is expected to go, see `service.execution.excursions`, which this process need not have loaded: it is
+    a work for another one.
+
+    near_limits_alone: only where PV may come near its limits.
+    """
+    from loopwright.service.execution.excursions import excursions, near_limits
+
+    return (near_limits if near_limits_alone else excursions)(config, request, state, known)
+
+
 def plan(
     config: LoopConfig,
     request: RetuneRequest,
@@ -148,6 +187,7 @@ def plan(
     earlier: Sequence[JobEvent] = (),
     plant: ObservedPlant | NothingKnown = NOT_ASKED,
     mode: Mode = Mode.AUTOMATIC,
+    begins_with: float | None = None,
 ) -> Plan[Any]:
     """Returns the plan of the requested procedure.
 
@@ -156,8 +196,9 @@ def plan(
     interrupted fast procedure is not continued: relay and set-point step are one record of an otherwise untouched loop.
     plant: what operation has shown of the plant.
     mode: the mode of the loop.
+    begins_with: the amplitude with which the relay of fast begins in place of its own, percent.
     """
-    procedure = _procedure(config, request, facts, earlier, plant, mode)
+    procedure = _procedure(config, request, facts, earlier, plant, mode, begins_with)
     return after_settling(facts, procedure, mode) if earlier else procedure
 
 
@@ -168,6 +209,7 @@ def _procedure(
     earlier: Sequence[JobEvent],
     plant: ObservedPlant | NothingKnown,
     mode: Mode,
+    begins_with: float | None,
 ) -> Plan[Any]:
     if isinstance(request, FastRetune):
         from loopwright.tuning.fast.design_trial import trial
@@ -176,7 +218,8 @@ def _procedure(
         known = _known_model(request)
         if known is not None:
             return trial(facts, request.options, known)
-        return fast_by(excitations(config, request, mode), facts, request.options, plant)
+        options = replace(request.options, begins_with=begins_with)
+        return fast_by(excitations(config, request, mode), facts, options, plant)
     if isinstance(request, SetpointRetune):
         from loopwright.tuning.fast.setpoint_procedure import setpoint
 

@@ -375,17 +375,27 @@ def _loop(file: PlantFile, mode: Mode) -> tuple[RehearsedLoop, Facts]:
     )
     positive = (file.num[-1] or file.num[0]) / (file.den[-1] or file.den[0]) > 0
     reverse = positive if file.reverse_acting is None else file.reverse_acting
-    span = 1e9
-    settings = Settings(mv_low=low, mv_high=high, safe_output=0.0, pv_low=-span, pv_high=span, reverse=reverse)
-    present = Gains(**gains.model_dump())
-    channel = Channel(ts, settings, _parameters(present), 0.0, int(mode), 0.0)
     facts = Facts(
-        ts, t95, low, high, step, present, reverse,
+        ts, t95, low, high, step, Gains(**gains.model_dump()), reverse,
         mv_step_max=file.mv_step_max or math.inf,
         directions=file.directions,
         sp_rate_max_per_s=file.sp_rate_max_per_s or math.inf,
     )  # fmt: skip
-    return RehearsedLoop(plant, channel, ts), facts
+    return _loop_of(plant, facts, mode), facts
+
+
+def loop_on(model: Model, facts: Facts, mode: Mode) -> RehearsedLoop:
+    """A loop without noise at rest on a model, with SP, PV and MV of 0. Raises ValueError: it cannot be simulated."""
+    num, den = list(model.num), list(model.den)
+    plant = LinearPlant(num, den, model.L, facts.sample_time_s, mv_low=facts.mv_low, mv_high=facts.mv_high)
+    return _loop_of(plant, facts, mode)
+
+
+def _loop_of(plant: SimulatedProcess, facts: Facts, mode: Mode) -> RehearsedLoop:
+    span = 1e9
+    settings = Settings(facts.mv_low, facts.mv_high, 0.0, pv_low=-span, pv_high=span, reverse=facts.reverse)
+    channel = Channel(facts.sample_time_s, settings, _parameters(facts.old_gains), 0.0, int(mode), 0.0)
+    return RehearsedLoop(plant, channel, facts.sample_time_s)
 
 
 def _limits(facts: Facts, reach: float) -> RunLimits:

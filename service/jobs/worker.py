@@ -28,6 +28,7 @@ from loopwright.service.inputs.request import (
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.loop_directory import LoopDirectory
+from loopwright.service.jobs.loop_model import loop_model
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.operation import OperationHeard, outdated_by
 from loopwright.service.jobs.registry import Registry
@@ -177,6 +178,7 @@ class Worker:
                 running.on_event, running.on_samples, lambda: running.stop_reason, earlier,
                 lambda session: self._lasting(lambda: self.store.note_session(row.id, session)),
                 lambda home: self._note_home(row.id, state, home), plant=plant,
+                model=self._lasting(lambda: loop_model(self.store, self._knowledge, config, request, state.gains)),
             )  # fmt: skip
             return self._tune(config, request, loop, state, hooks)
         finally:

@@ -1,7 +1,8 @@
 """States before a test what each stage of a retune moves, and how far at most.
 
 The figures are the moves that the procedures command (`tuning.fast.relay_test`, `tuning.five_stage`). In automatic the
-controller's feedback may take MV farther; the limits of the test apply there too.
+controller's feedback may take MV farther; the limits of the test apply there too. How far PV goes is told by
+`planning.expected`.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.excitation_choice import chosen_stages
-from loopwright.tuning.fast.known_procedure import FARTHEST
 from loopwright.tuning.fast.manual_procedure import MANUAL
 from loopwright.tuning.fast.manual_sizes import first_pulse, largest_pulse
 from loopwright.tuning.fast.manual_test import LONGEST_PULSE_T95
@@ -31,11 +31,6 @@ from loopwright.tuning.plan import Mode
 
 _COMPUTING = ("design", "redesign", "estimate", "optimise")
 _STEPPING = ("baseline", "ultimate", "zn_pi", "verify", "trial")
-_BY_FIRST_PULSE = 1.5
-"""Largest excursion of PV per permitted step under the first pulse of the manual output, which no model sizes: 1.3 in
-the benchmarks, under present gains that are nearly unstable."""
-_UNDER_PRESENT_GAINS, _UNDER_NEW_GAINS = 2.0, 1.4
-"""Largest excursion of PV per set-point step: in a loop that is just stable, and as far as `verification` permits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +39,6 @@ class Moves:
 
     mv_down, mv_up: largest moves of MV from its present value, percent, both positive.
     sp_up, sp_down: largest moves of the set-point from its present value, PV units, both positive.
-    pv: expected excursion of PV from the present set-point, PV units; None where it is not known.
     first_mv: initial amplitude of the relay, or size of the first pulse of the manual output, percent; None without.
     """
 
@@ -54,7 +48,6 @@ class Moves:
     mv_up: float = 0.0
     sp_up: float = 0.0
     sp_down: float = 0.0
-    pv: float | None = 0.0
     first_mv: float | None = None
 
 
@@ -135,16 +128,16 @@ class Before:
 
     gains: the gains in effect.
     mv: the present MV, percent.
-    Ku: the ultimate gain of the last model, percent per PV unit.
     mode: the mode; automatic where it is not known.
     reverse: whether MV has to fall as PV rises.
+    begins_with: the amplitude with which the relay begins in place of its own, percent.
     """
 
     gains: Gains | None = None
     mv: float | None = None
-    Ku: float | None = None
     mode: Mode = Mode.AUTOMATIC
     reverse: bool = True
+    begins_with: float | None = None
 
 
 def moves(config: LoopConfig, request: RetuneRequest, before: Before) -> list[Moves]:
@@ -195,7 +188,7 @@ def _by_excitation(stage: str, config: LoopConfig, request: FastRetune, before: 
     what = f"After pulses: {pulses.what} After the relay: {relay.what}"
     return Moves(
         stage, what, max(pulses.mv_down, relay.mv_down), max(pulses.mv_up, relay.mv_up),
-        max(pulses.sp_up, relay.sp_up), max(pulses.sp_down, relay.sp_down), _UNDER_NEW_GAINS * config.sp_deviation,
+        max(pulses.sp_up, relay.sp_up), max(pulses.sp_down, relay.sp_down),
     )  # fmt: skip
 
 
@@ -205,26 +198,27 @@ def _fast(stage: str, config: LoopConfig, request: FastRetune, before: Before) -
     mv = low + BIAS / (1.0 + BIAS) * (high - low) if before.mv is None else before.mv
     maximum = max(0.0, max_amplitude(mv, low, high, jump))
     given = request.amplitude_pct
-    first = given or FIRST_AMPLITUDE * maximum
+    first = given or before.begins_with or FIRST_AMPLITUDE * maximum
     up = min(MAX_RAISE * given, maximum) if given else maximum
     if stage != "relay":
         what = (
             f"The set-point is stepped up by up to {step:g} {unit} under the new gains, on trial; it is stepped back "
             f"where the record is not conclusive.{_ramp(config, step)}"
         )
-        return Moves(stage, what, up, up, step, pv=_UNDER_NEW_GAINS * step)
-    size, mean = "The size stays", 0.5 * (1.0 + BIAS)
-    pv = _oscillation(mean * first, before.Ku)
+        return Moves(stage, what, up, up, step)
+    size = "The size stays"
     if given is None:
         most = MAX_OUTPUT_RANGE * step
-        size = f"After the first wave the size is adapted, so that PV moves by at most {most:g} {unit} in all"
-        if pv is not None:  # only MV bounds the first wave
-            pv = max(pv, min(0.5 * MAX_OUTPUT_RANGE * step, pv * maximum / first if first else 0.0))
+        smaller = " Smaller than usual, so that PV keeps its limits." if before.begins_with else ""
+        size = (
+            f"{smaller} Where the first wave moves PV by more than {most:g} {unit} from end to end, the later ones are "
+            "made smaller; where PV hardly shows, larger"
+        ).strip()
     what = (
         f"A relay in the controller moves MV by +{first:.4g} and -{BIAS * first:.4g} % at first. {size}; a side on "
         "which PV stalls is raised, up to twice."
     )
-    return Moves(stage, what, BIAS * up, up, pv=pv, first_mv=first)
+    return Moves(stage, what, BIAS * up, up, first_mv=first)
 
 
 def _setpoint(stage: str, config: LoopConfig, before: Before) -> Moves:
@@ -240,13 +234,13 @@ def _setpoint(stage: str, config: LoopConfig, before: Before) -> Moves:
         )
         if one_sided:
             what += " A gain that differs above and below where it begins is not seen."
-        return Moves(stage, what, room, room, *_sides(config, step, step), _UNDER_PRESENT_GAINS * step)
+        return Moves(stage, what, room, room, *_sides(config, step, step))
     again = "once more, by half as much"
     what = (
         f"The set-point goes back by {step:.4g} {unit} to where it was, under the new gains, on trial; it is stepped "
         f"{again}, where the record is not conclusive.{_ramp(config, step)}"
     )
-    return Moves(stage, what, room, room, *_sides(config, step, 0.0), pv=_UNDER_NEW_GAINS * step)
+    return Moves(stage, what, room, room, *_sides(config, step, 0.0))
 
 
 def _manual(config: LoopConfig, before: Before) -> Moves:
@@ -264,7 +258,7 @@ def _manual(config: LoopConfig, before: Before) -> Moves:
     if side is not None:
         what += " A gain that differs above and below where MV is is not seen."
     up, down = (0.0 if side is not None and side * sign < 0.0 else most for sign in (1.0, -1.0))
-    return Moves(MANUAL, what, down, up, pv=_BY_FIRST_PULSE * step, first_mv=first)
+    return Moves(MANUAL, what, down, up, first_mv=first)
 
 
 def _known_trial(config: LoopConfig, before: Before) -> Moves:
@@ -275,7 +269,7 @@ def _known_trial(config: LoopConfig, before: Before) -> Moves:
         f"conclusive. A plant that is another one by now shows in it; the present gains then take over again."
         f"{_ramp(config, step)}"
     )
-    return Moves("trial", what, kick, kick, *_sides(config, step, 0.0), pv=FARTHEST * step)
+    return Moves("trial", what, kick, kick, *_sides(config, step, 0.0))
 
 
 def _trial(stage: str, config: LoopConfig, before: Before) -> Moves:
@@ -284,7 +278,7 @@ def _trial(stage: str, config: LoopConfig, before: Before) -> Moves:
         f"The set-point is stepped {_first(config)} by up to {step:g} {config.pv_unit} under the new gains, on trial, "
         "and back."
     )
-    return Moves(stage, what, kick, kick, *_sides(config, step, 0.0), pv=_UNDER_NEW_GAINS * step)
+    return Moves(stage, what, kick, kick, *_sides(config, step, 0.0))
 
 
 def _first(config: LoopConfig) -> str:
@@ -317,31 +311,26 @@ def _five_stage(stage: str, config: LoopConfig, request: FiveStages, before: Bef
         what = (
             f"A relay in the controller moves MV by +-{room:.4g} %, all the room there is, until PV oscillates evenly."
         )
-        return Moves(stage, what, room, room, pv=_oscillation(room, before.Ku), first_mv=room)
+        return Moves(stage, what, room, room, first_mv=room)
     if stage == "ultimate":
         what = (
             f"Set-point steps of up to {step:g} {unit} under a P controller, two to five runs, until PV "
             "oscillates by itself; a run ends where MV reaches its limit. In between MV is held in manual."
         )
         run = RUN_MV_LIMIT * room
-        return Moves(stage, what, run, run, step, pv=_UNDER_PRESENT_GAINS * step)
+        return Moves(stage, what, run, run, step)
     if stage == "zn_pi":
         low, high = request.overshoot_window_pct
         what = (
             f"Set-point steps of up to {step:g} {unit} under a Ziegler-Nichols PI, until PV overshoots by {low:g} to "
             f"{high:g} %."
         )
-        return Moves(stage, what, kick, kick, step, pv=(1.0 + high / 100.0) * step)
+        return Moves(stage, what, kick, kick, step)
     if gains is not None and gains.Kp > 0.0:
         step = min(step, kick / gains.Kp)  # `allowed_step` of the old gains bounds both steps
-    which, farthest = ("present", _UNDER_PRESENT_GAINS) if stage == "baseline" else ("new", _UNDER_NEW_GAINS)
+    which = "present" if stage == "baseline" else "new"
     what = f"The set-point is stepped up by up to {step:.4g} {unit} under the {which} gains, and back."
-    return Moves(stage, what, kick, kick, step, pv=farthest * step)
-
-
-def _oscillation(amplitude: float, Ku: float | None) -> float | None:
-    """Returns the amplitude of PV under a relay by the describing function, PV units."""
-    return 4.0 * amplitude / (math.pi * Ku) if Ku else None
+    return Moves(stage, what, kick, kick, step)
 
 
 def _room(config: LoopConfig, mv: float | None) -> float:

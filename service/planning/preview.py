@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from pydantic import BaseModel, Field
@@ -12,14 +12,15 @@ from loopwright.service.inputs.config import Limits, LoopConfig
 from loopwright.service.inputs.request import FiveStages, RetuneRequest, narrow
 from loopwright.service.planning.durations import Span, durations
 from loopwright.service.planning.excitation_preview import ExcitationPreview, excitation_previews
+from loopwright.service.planning.expected import NOTHING_EXPECTED, Expected, Reach
 from loopwright.service.planning.facts import time_budget_s
 from loopwright.service.planning.moves import Before, Moves, moves, stages_asked
 from loopwright.service.planning.obstacles import Now, Obstacle, Occupied, obstacles
 from loopwright.service.results import KnowledgeView, Result, TransferModelView
 from loopwright.service.states.loop_state import LoopState
-from loopwright.tuning.fast.manual_procedure import MANUAL
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
+from loopwright.tuning.reasons import Reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +75,12 @@ class StagePreview(BaseModel):
     sp_high: float | None = Field(description="Set-point at most, PV units", examples=[52.0])
     sp_move: float = Field(description="The largest step of the set-point, PV units", examples=[2.0])
     pv_move: float | None = Field(
-        description="How far PV is expected to go from the present set-point, in manual from its present value, PV "
-        "units; null: not known before",
+        description="How far PV goes at most from the present set-point, in manual from its present value, by the "
+        "model that is known, PV units; null: there is none",
         examples=[2.8],
     )
+    pv_low: float | None = Field(description="PV is expected not to go below this, PV units; null likewise")
+    pv_high: float | None = Field(description="PV is expected not to go above this, PV units; null likewise")
     duration_low_s: float = Field(description="Expected at least, plant time, s", examples=[7.0])
     duration_high_s: float = Field(description="Expected at most, plant time, s", examples=[30.0])
 
@@ -128,8 +131,22 @@ class Preview(BaseModel):
         description="The largest step of the set-point in any stage, PV units", examples=[2.0]
     )
     largest_pv_move: float | None = Field(
-        description="How far PV is expected to go from the present set-point, PV units; null: not known before",
+        description="How far PV goes at most in any stage, PV units; null: not known, there is no model of every stage",
         examples=[2.8],
+    )
+    mv_low_pct: float | None = Field(
+        description="The test moves MV down to this at most in any stage, percent; null: the present MV is not known",
+        examples=[24.0],
+    )
+    mv_high_pct: float | None = Field(description="Likewise up to this", examples=[75.0])
+    pv_low: float | None = Field(
+        description="PV is expected not to go below this in any stage, PV units; null as of largest_pv_move",
+        examples=[48.2],
+    )
+    pv_high: float | None = Field(description="Likewise not above this", examples=[53.1])
+    pv_known_by: str | None = Field(
+        description="The model that this is computed from, in words; null: none is known of the loop",
+        examples=["the model known from job 4f0c2a9be113"],
     )
     duration_low_s: float = Field(description="Shortest expected time of all stages, plant time, s", examples=[40.0])
     duration_high_s: float = Field(description="Longest expected time of all stages, plant time, s", examples=[160.0])
@@ -149,10 +166,12 @@ def preview(
     now: Now,
     last: LastProposal | None,
     knowledge: KnowledgeView | None = None,
+    expected: Expected = NOTHING_EXPECTED,
 ) -> Preview:
     """Returns the preview of one loop.
 
     knowledge: what is known of the loop from its tests and from operation.
+    expected: how far PV is expected to go, by the model that is known.
     now: without a state in it the figures are the largest that the configured limits permit.
     last: the last retune of the loop that ended in a proposal; None where there is none.
     """
@@ -160,8 +179,7 @@ def preview(
     state = None if request.dry_run else now.state
     permitted = _permitted(narrowed, state)
     limited = narrowed.model_copy(update={"mv_limits": permitted})
-    Ku, Pu_s = _entered(request)
-    pu_s = Pu_s or (last.Pu_s if last else None)
+    pu_s = _entered_Pu_s(request) or (last.Pu_s if last else None)
     sample_time_s = state.sample_time_s if state else None
     rate = narrowed.test.sp_rate_max_per_s
     ramp_s = narrowed.sp_deviation / rate if rate else 0.0
@@ -169,12 +187,16 @@ def preview(
     times = durations(request, stages_asked(narrowed, request, mode), config.t95_s, sample_time_s, pu_s, ramp_s)
     mv, sp = (_finite(state.mv), _finite(state.sp)) if state else (None, None)
     before = Before(
-        state.gains if state else None, mv, Ku or (last.Ku if last else None), mode,
-        state.reverse_acting if state else True,
-    )  # fmt: skip
+        state.gains if state else None, mv, mode, state.reverse_acting if state else True, expected.begins_with_pct
+    )
     moved = [] if request.dry_run else moves(limited, request, before)
-    stages = [_stage(each, times[each.stage], permitted, mv, sp) for each in moved]
+    rest = _finite(state.pv) if state and mode is Mode.MANUAL else sp
+    stages = [
+        _stage(each, times[each.stage], permitted, mv, sp, rest, expected.stages.get(each.stage)) for each in moved
+    ]
     in_the_way = obstacles(config, request, now)
+    in_the_way += [Obstacle(Reason.BAD_LIMITS, text) for text in expected.broken]
+    moving = [each for each in stages if each.mv_move_pct or each.sp_move]
     found = Preview(
         loop=config.tag,
         method=request.method,
@@ -189,7 +211,12 @@ def preview(
         first_mv_move_pct=next((_rounded(each.first_mv) for each in moved if each.first_mv is not None), None),
         largest_mv_move_pct=max((each.mv_move_pct for each in stages), default=0.0),
         largest_sp_move=max((each.sp_move for each in stages), default=0.0),
-        largest_pv_move=_largest_pv(stages),
+        largest_pv_move=_all_known([each.pv_move for each in stages], max),
+        mv_low_pct=_end([each.mv_low_pct for each in stages], min),
+        mv_high_pct=_end([each.mv_high_pct for each in stages], max),
+        pv_low=_all_known([each.pv_low for each in moving], min),
+        pv_high=_all_known([each.pv_high for each in moving], max),
+        pv_known_by=expected.source or None,
         duration_low_s=_rounded(sum(each.duration_low_s for each in stages)),
         duration_high_s=_rounded(sum(each.duration_high_s for each in stages)),
         duration_basis=_basis(request, config, last),
@@ -211,9 +238,19 @@ def _permitted(config: LoopConfig, state: LoopState | None) -> Limits:
     return limits.model_copy(update={"low": low, "high": high}) if low < high else limits
 
 
-def _stage(each: Moves, time: Span, mv_limits: Limits, mv: float | None, sp: float | None) -> StagePreview:
+def _stage(
+    each: Moves,
+    time: Span,
+    mv_limits: Limits,
+    mv: float | None,
+    sp: float | None,
+    rest: float | None,
+    reach: Reach | None,
+) -> StagePreview:
     moves_mv, moves_sp = max(each.mv_down, each.mv_up) > 0.0, max(each.sp_up, each.sp_down) > 0.0
     low, high = time
+    still = not (moves_mv or moves_sp)
+    known = None if still or rest is None else reach
     return StagePreview(
         stage=each.stage,
         what=each.what,
@@ -223,15 +260,23 @@ def _stage(each: Moves, time: Span, mv_limits: Limits, mv: float | None, sp: flo
         sp_low=_rounded(sp - each.sp_down) if sp is not None and moves_sp else None,
         sp_high=_rounded(sp + each.sp_up) if sp is not None and moves_sp else None,
         sp_move=_rounded(max(each.sp_up, each.sp_down)),
-        pv_move=None if each.pv is None else _rounded(each.pv),
+        pv_move=0.0 if still else None if reach is None else _rounded(reach.farthest),
+        pv_low=None if known is None or rest is None else _rounded(rest - known.down),
+        pv_high=None if known is None or rest is None else _rounded(rest + known.up),
         duration_low_s=_rounded(low),
         duration_high_s=_rounded(high),
     )
 
 
-def _largest_pv(stages: Sequence[StagePreview]) -> float | None:
-    known = [each.pv_move for each in stages if each.pv_move is not None]
-    return max(known, default=0.0) if len(known) == len(stages) else None
+def _end(values: Sequence[float | None], end: Callable[[Sequence[float]], float]) -> float | None:
+    """The smallest or largest of what is known; None where nothing is."""
+    known = [each for each in values if each is not None]
+    return end(known) if known else None
+
+
+def _all_known(values: Sequence[float | None], end: Callable[[Sequence[float]], float]) -> float | None:
+    """The same; None also where one is not known."""
+    return None if None in values else _end(values, end)
 
 
 def _obstacle(found: Obstacle, now: Now) -> ObstacleView:
@@ -245,15 +290,15 @@ def _budget_s(request: RetuneRequest, config: LoopConfig, state: LoopState | Non
     return time_budget_s(request.method, config.t95_s, state.sample_time_s)
 
 
-def _entered(request: RetuneRequest) -> tuple[float | None, float | None]:
-    """Returns the ultimate gain and period of the request; None for each that was not entered."""
-    return (request.Ku, request.Pu_s) if isinstance(request, FiveStages) else (None, None)
+def _entered_Pu_s(request: RetuneRequest) -> float | None:
+    """Returns the ultimate period of the request; None where it was not entered."""
+    return request.Pu_s if isinstance(request, FiveStages) else None
 
 
 def _basis(request: RetuneRequest, config: LoopConfig, last: LastProposal | None) -> str:
     if request.dry_run:
         return "a dry run takes no time of the plant"
-    if (Pu_s := _entered(request)[1]) is not None:
+    if (Pu_s := _entered_Pu_s(request)) is not None:
         return f"Pu {Pu_s:g} s as entered, and T95 {config.t95_s:g} s of the configuration"
     if last is not None and last.Pu_s:
         return f"Pu {last.Pu_s:.4g} s of the model that job {last.job_id} found, and T95 {config.t95_s:g} s"
@@ -309,18 +354,12 @@ def _summary(found: Preview, unit: str) -> list[str]:
         return [f"A dry run of {found.loop} is computed in memory; nothing on the loop is moved."]
     first = "" if found.first_mv_move_pct is None else f"by {found.first_mv_move_pct:.3g} % at first and "
     limits = f"{found.watched.mv.low:g} .. {found.watched.mv.high:g} %"
-    goes = "How far PV goes under the relay is not known beforehand."
-    if found.largest_pv_move is not None:
-        where = (
-            "where it is now" if any(each.stage == MANUAL for each in found.stages) else "the set-point as it is now"
-        )
-        goes = f"PV is expected to go up to {found.largest_pv_move:.3g} {unit} from {where}."
     time, pv = duration_text(found.duration_low_s, found.duration_high_s), found.watched.pv
     lines = [
         f"A retune of {found.loop} by {found.method} moves MV {first}by at most {found.largest_mv_move_pct:.3g} %, "
         f"within {limits}, and the set-point by at most {found.largest_sp_move:.4g} {unit}.",
         f"It takes {time} of plant time; that is estimated from {found.duration_basis}.",
-        f"{goes} It is watched within {pv.low:g} .. {pv.high:g} {unit}: beyond that the test ends.",
+        f"{_goes(found, unit)} PV is watched within {pv.low:g} .. {pv.high:g} {unit}: beyond that the test ends.",
         f"After an abort, a limit or a failure: {found.on_abort}",
         f"At the end: {found.at_the_end}",
     ]
@@ -328,6 +367,29 @@ def _summary(found: Preview, unit: str) -> list[str]:
     if found.mv is None:
         lines.insert(1, "The loop could not be read: these are the largest moves that the configured limits permit.")
     return lines
+
+
+def _goes(found: Preview, unit: str) -> str:
+    """How far MV and PV go, in sentences."""
+    mv = ""
+    if found.mv_low_pct is not None and found.mv_high_pct is not None:
+        mv = f"MV moves between {found.mv_low_pct:.3g} and {found.mv_high_pct:.3g} % (present {found.mv:.3g} %)"
+    if found.pv_low is not None and found.pv_high is not None:
+        pv = f"PV is expected between {_pv(found.pv_low, found)} and {_pv(found.pv_high, found)} {unit}"
+        return f"{mv}{', ' if mv else ''}{pv}, by {found.pv_known_by}."
+    partly = [each for each in found.stages if each.pv_low is not None and each.pv_high is not None]
+    pv = "How far PV goes is not known beforehand: no model of this loop is known."
+    if partly:
+        of = "; ".join(f"{s.stage} {_pv(s.pv_low, found)} to {_pv(s.pv_high, found)} {unit}" for s in partly)
+        pv = f"How far PV goes is known of some stages alone, by {found.pv_known_by}: {of}."
+    return f"{mv}. {pv}" if mv else pv
+
+
+def _pv(value: float | None, found: Preview) -> str:
+    """PV with a hundredth of its way."""
+    assert value is not None
+    way = (found.largest_pv_move or max(each.pv_move or 0.0 for each in found.stages)) or 1.0
+    return f"{value:.{max(0, 2 - math.floor(math.log10(way)))}f}"
 
 
 def _told(each: ExcitationPreview) -> str:

@@ -104,9 +104,8 @@ def _moved_by(excitations: tuple[Excitation, ...], facts: Facts, options: FastOp
             f"{refused.detail}; and the relay cannot follow: MV stays {away:+.4g} from rest, and a relay "
             f"would jump further than the permitted {facts.mv_step_max:.4g}",
         ) from refused
-    return (
-        yield from by_relay(facts, options, RelayTest(facts, test.point, test.trace, options.amplitude, test.listened))
-    )
+    relay = RelayTest(facts, test.point, test.trace, options.amplitude, test.listened, options.begins_with)
+    return (yield from by_relay(facts, options, relay))
 
 
 def _near_rest(test: PulseTest, facts: Facts) -> Plan[bool]:

@@ -92,9 +92,12 @@ class TrialFigures:
 
 
 class KnownTrial(Experiment):
-    """The set-point step under gains designed on the known plant, from rest, and its record."""
+    """The set-point step under gains designed on the known plant, from rest, and its record.
 
-    def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace, known: ObservedPlant) -> None:
+    known: the known plant; None where the step alone is of interest, and nobody asks for the record.
+    """
+
+    def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace, known: ObservedPlant | None) -> None:
         super().__init__(facts, point, listened)
         self._known = known
         self._period = 0.0
@@ -122,6 +125,7 @@ class KnownTrial(Experiment):
 
     def experiment_record(self) -> ExperimentRecord:
         """The record of operation with the step as its last piece."""
+        assert self._known is not None
         rest = max(round(REST_PERIODS * self._period / self.facts.sample_time_s), 2 * self._known.together)
         first = max(self._steps[0] - rest, 0)
         record = self._known.with_trial(self.trace, first, self._steps, self._known.record.period)

@@ -7,6 +7,7 @@ plant is in open loop, so that its PV is what MV has set going already, and the 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,19 +70,26 @@ def first_pulse(kick: float, largest: float) -> float:
 
 
 def next_pulse(
-    past: ManualRecord, side: float, width: int, bounds: PulseBounds, before: float, largest: float
+    past: ManualRecord,
+    side: float,
+    width: int,
+    bounds: PulseBounds,
+    before: float,
+    largest: float,
+    models: Sequence[Model] = (),
 ) -> float:
     """The size of a pulse that begins now, MV units: as large as every model that explains the record permits; 0 where
     PV needs more rest first.
 
     side: +1 for a pulse up, -1 for one down. width: its length, in samples.
     before: the size of the pulse before. largest: the largest size that MV permits, MV units.
+    models: these in place of those that explain the record.
     """
     first = max(past.begun - RESTED, 0)
     try:
-        models = candidate_models(past.u[first:], past.y[first:], past.Ts, past.action)
+        models = models or candidate_models(past.u[first:], past.y[first:], past.Ts, past.action)
     except Refused:
-        models = []
+        models = ()
     if not models:
         return min(before, largest)
     samples = int(HORIZON * width) + len(past.y) - past.begun

@@ -7,7 +7,7 @@ computation prolongs a pulse; if everything of ours dies meanwhile, the controll
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeVar
 
@@ -22,7 +22,7 @@ from loopwright.tuning.fast.pulse_test import MAX_BEYOND, SAMPLES_AVERAGED
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.record_evaluation import MIN_PERIOD
 from loopwright.tuning.fast.self_regulation import comes_to_rest
-from loopwright.tuning.models import Reals
+from loopwright.tuning.models import Model, Reals
 from loopwright.tuning.plan import Command, Note, Plan, Sample, SetOutput, SetPvLimits
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -118,10 +118,12 @@ class ManualTest(Experiment):
         )
         raise Refused(Reason.NO_RESPONSE, text)
 
-    def pulse(self, width: int) -> Plan[bool]:
+    def pulse(self, width: int, models: Sequence[Model] = ()) -> Plan[bool]:
         """Makes a pulse of this length, in samples, to the side whose turn it is, as large as PV and MV permit. Returns
-        False where PV has to come nearer to rest first."""
-        sizing = partial(next_pulse, self._past(), self.side, width, self._bounds(), self.size, self.largest)
+        False where PV has to come nearer to rest first.
+
+        models: those that it is sized by, in place of those that explain the record."""
+        sizing = partial(next_pulse, self._past(), self.side, width, self._bounds(), self.size, self.largest, models)
         size = yield from self.computed(sizing)
         if not size:
             return False

@@ -53,10 +53,13 @@ class FastOptions(DesignOptions):
 
     amplitude: the amplitude of the relay's higher side, MV units; by default half of what MV permits, adapted after the
     first wave.
+    begins_with: the amplitude with which the default begins in place of its own, larger one, MV units: so that PV keeps
+    its limits.
     careful: the relay switches six times at least; without the set-point step it does so in any case.
     """
 
     amplitude: float | None = None
+    begins_with: float | None = None
     careful: bool = False
 
     def __post_init__(self) -> None:
@@ -96,7 +99,7 @@ def fast_by_relay(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
     expected = _expected_s(facts)
     after_s = sum(expected[stage] for stage in fast_stages(options.verify)[1:])
     point, listened = yield from at_rest(facts, after_s, MIN_SAMPLES)
-    experiment = RelayTest(facts, point, listened, options.amplitude)
+    experiment = RelayTest(facts, point, listened, options.amplitude, begins_with=options.begins_with)
     yield from experiment.report(StageDone("preflight", point))
     return (yield from by_relay(facts, options, experiment))
 

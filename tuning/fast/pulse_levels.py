@@ -17,7 +17,7 @@ from loopwright.tuning.identification.disturbances import by_bic
 from loopwright.tuning.identification.output_error import UNDISTURBED
 from loopwright.tuning.identification.problem import IdentificationProblem
 from loopwright.tuning.identification.record import recorded_test
-from loopwright.tuning.identification.structures import FIRST, INTEGRATOR, LAGGED_INTEGRATOR, SECOND
+from loopwright.tuning.identification.structures import FIRST, INTEGRATOR, LAGGED_INTEGRATOR, SECOND, Structure
 from loopwright.tuning.models import Model, Reals, sign
 from loopwright.tuning.reasons import Refused
 
@@ -58,7 +58,9 @@ class PulseBounds:
     noise: float
 
 
-def candidate_models(u: Reals, y: Reals, Ts: float, action: float) -> list[Model]:
+def candidate_models(
+    u: Reals, y: Reals, Ts: float, action: float, structures: Sequence[Structure] = STRUCTURES
+) -> list[Model]:
     """The models of lags that explain a record about as well as the best one, the best one first.
 
     u, y: MV and PV as deviations from rest, shape (N,). Ts: the sample time, s.
@@ -66,17 +68,18 @@ def candidate_models(u: Reals, y: Reals, Ts: float, action: float) -> list[Model
     Raises Refused as `recorded_test`.
     """
     problem = IdentificationProblem(recorded_test(Ts * np.arange(len(u)), u, y, 0.0))
-    ranked = sorted((problem.fit(structure, UNDISTURBED) for structure in STRUCTURES), key=by_bic)
+    ranked = sorted((problem.fit(structure, UNDISTURBED) for structure in structures), key=by_bic)
     found = [(fit.bic, problem.model(fit)) for fit in ranked]
     right = [(bic, model) for bic, model in found if sign(model) == action]
     return [model for bic, model in right if bic <= right[0][0] + CLOSE_BIC]
 
 
-def second_level(past: Past, begun: int, size: float, bounds: PulseBounds) -> float:
+def second_level(past: Past, begun: int, size: float, bounds: PulseBounds, models: Sequence[Model] = ()) -> float:
     """The level of the second pulse, in sizes of the first: negative, and as far from rest as every candidate model
     permits. The third level, which PV calls for when it has followed, is then one that suits.
 
     past: the record so far. begun: the sample of the first pulse. size: the size of the first pulse, PV units.
+    models: these in place of those that explain the record.
     """
     second = LEVELS[LEVELS >= MIN_LEVEL - 1e-9]
     third = LEVELS[::5]
@@ -88,10 +91,10 @@ def second_level(past: Past, begun: int, size: float, bounds: PulseBounds) -> fl
         found = _excess(course, past, bounds, SECOND_MAY_USE).reshape(len(second), len(third))
         return np.asarray(found.min(axis=1))
 
-    return -_largest(second, past, begun, HORIZON_OF_SECOND, excess)
+    return -_largest(second, past, begun, HORIZON_OF_SECOND, excess, models)
 
 
-def back_level(past: Past, begun: int, size: float, bounds: PulseBounds) -> float:
+def back_level(past: Past, begun: int, size: float, bounds: PulseBounds, models: Sequence[Model] = ()) -> float:
     """The level after the first pulse where the set-point may go to one side of its rest only, in sizes of the first
     pulse: as near to rest as every candidate model permits. The arguments are those of `second_level`; the size is
     negative where the set-point goes down."""
@@ -107,26 +110,30 @@ def back_level(past: Past, begun: int, size: float, bounds: PulseBounds) -> floa
         found = _excess(course, past, bounds, SECOND_MAY_USE).reshape(len(swings), len(last))
         return np.asarray(found.min(axis=1))
 
-    return 1.0 - _largest(swings, past, begun, HORIZON_OF_SECOND, excess)
+    return 1.0 - _largest(swings, past, begun, HORIZON_OF_SECOND, excess, models)
 
 
-def last_level_of_one_side(past: Past, begun: int, size: float, bounds: PulseBounds) -> float:
+def last_level_of_one_side(
+    past: Past, begun: int, size: float, bounds: PulseBounds, models: Sequence[Model] = ()
+) -> float:
     """The level of the last pulse where the set-point may go to one side of its rest only, see `last_level`. It is
     never at rest: the step home begins there."""
-    return _last_level(LEVELS[LEVELS >= MIN_LEVEL - 1e-9], past, begun, size, bounds)
+    return _last_level(LEVELS[LEVELS >= MIN_LEVEL - 1e-9], past, begun, size, bounds, models)
 
 
-def last_level(past: Past, begun: int, size: float, bounds: PulseBounds) -> float:
+def last_level(past: Past, begun: int, size: float, bounds: PulseBounds, models: Sequence[Model] = ()) -> float:
     """The level of the last pulse, in sizes of the first: the largest at which every candidate model keeps PV and MV
     within bounds, or the one that leaves them least. The arguments are those of `second_level`."""
-    return _last_level(LEVELS, past, begun, size, bounds)
+    return _last_level(LEVELS, past, begun, size, bounds, models)
 
 
-def _last_level(levels: Reals, past: Past, begun: int, size: float, bounds: PulseBounds) -> float:
+def _last_level(
+    levels: Reals, past: Past, begun: int, size: float, bounds: PulseBounds, models: Sequence[Model]
+) -> float:
     def excess(model: Model, samples: int) -> Reals:
         return _excess(forecast(model, past, past.gains, size * levels, samples), past, bounds, LAST_MAY_USE)
 
-    return _largest(levels, past, begun, HORIZON_OF_LAST, excess)
+    return _largest(levels, past, begun, HORIZON_OF_LAST, excess, models)
 
 
 def step_fits(past: Past, models: Sequence[Model], gains: Gains, home: float, noise: float, samples: int) -> bool:
@@ -140,21 +147,32 @@ def step_fits(past: Past, models: Sequence[Model], gains: Gains, home: float, no
     return all(bool(np.all((mv > past.low + left) & (mv < past.high - left))) for mv in courses)
 
 
-def _largest(levels: Reals, past: Past, begun: int, horizon: float, excess: Callable[[Model, int], Reals]) -> float:
+def _largest(
+    levels: Reals,
+    past: Past,
+    begun: int,
+    horizon: float,
+    excess: Callable[[Model, int], Reals],
+    models: Sequence[Model],
+) -> float:
     """The first of the levels without an excess on any candidate model, or the one with the least."""
-    first = max(begun - RESTED, 0)
-    try:
-        # at rest only the noise moves MV, in which a model of so short a record would find what it needs
-        mv = np.where(np.arange(len(past.mv)) < begun, 0.0, past.mv)
-        models = candidate_models(mv[first:], past.pv[first:], past.Ts, past.action)
-    except Refused:
-        models = []
+    models = models or _explaining(past, begun)
     if not models:
         return WITHOUT_A_MODEL
     samples = int(horizon * (len(past.pv) - begun))
     worst = np.max([excess(model, samples) for model in models], axis=0)
     within = np.flatnonzero(worst <= 0.0)
     return float(levels[within[0] if len(within) else np.argmin(worst)])
+
+
+def _explaining(past: Past, begun: int) -> list[Model]:
+    first = max(begun - RESTED, 0)
+    # at rest only the noise moves MV, in which a model of so short a record would find what it needs
+    mv = np.where(np.arange(len(past.mv)) < begun, 0.0, past.mv)
+    try:
+        return candidate_models(mv[first:], past.pv[first:], past.Ts, past.action)
+    except Refused:
+        return []
 
 
 def _excess(course: Course, past: Past, bounds: PulseBounds, part: float) -> Reals:

@@ -8,6 +8,7 @@ well enough, further pulses follow, or, where those would take longer than the s
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 
 from loopwright.tuning.experiments.ramp import slow_words
@@ -18,6 +19,7 @@ from loopwright.tuning.fast.pulse_test import BACK, DOWN, UP, PulseTest
 from loopwright.tuning.fast.pulse_test import MAX_T95 as MAX_T95_TO_FOLLOW
 from loopwright.tuning.fast.record_evaluation import first_period
 from loopwright.tuning.fast.still_open import OPEN_REASONS, open_by, samples_needed, trial_may_tell
+from loopwright.tuning.models import Model
 from loopwright.tuning.plan import Note, Plan
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -103,30 +105,34 @@ def _first_pulses(test: PulseTest, relay_follows: bool) -> Plan[None]:
     yield from test.start()
     try:
         yield from test.until_followed(longest_T95)
-        yield from _turn_down(test)
+        yield from turn_down(test)
         yield from test.until_followed(longest_T95)
     except Refused as refused:
         if relay_follows and refused.reason in NOT_FOLLOWED:
             raise TooLittleExcited(refused, test) from None
         raise
-    yield from _turn_up(test)
+    yield from turn_up(test)
 
 
 def _two_pulses_more(test: PulseTest, samples: int) -> Plan[None]:
     """The set-point down and up once more; each time when PV has followed the move before, or after so many samples."""
     yield from test.followed_or_for(samples)
-    yield from _turn_down(test)
+    yield from turn_down(test)
     yield from test.followed_or_for(samples)
-    yield from _turn_up(test)
+    yield from turn_up(test)
 
 
-def _turn_down(test: PulseTest) -> Plan[None]:
+def turn_down(test: PulseTest, models: Sequence[Model] = ()) -> Plan[None]:
+    """The set-point down, to one side only: back. models: those that the turn is sized by, in place of those that
+    explain the record."""
     level, wanted = (back_level, BACK) if test.facts.one_sided else (second_level, DOWN)
-    yield from test.turn_within_bounds(level, wanted)
+    yield from test.turn_within_bounds(partial(level, models=models), wanted)
 
 
-def _turn_up(test: PulseTest) -> Plan[None]:
-    yield from test.turn_within_bounds(last_level_of_one_side if test.facts.one_sided else last_level, UP)
+def turn_up(test: PulseTest, models: Sequence[Model] = ()) -> Plan[None]:
+    """The set-point up again. models: as of `turn_down`."""
+    level = last_level_of_one_side if test.facts.one_sided else last_level
+    yield from test.turn_within_bounds(partial(level, models=models), UP)
 
 
 def _trial_instead(test: PulseTest, look: Look, last: Look, longest: float) -> str | None:

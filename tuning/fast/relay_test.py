@@ -40,6 +40,8 @@ MIN_OUTPUT_RANGE, GOOD_OUTPUT_RANGE = 25.0, 60.0
 """Smallest and desired range of PV under the relay, in standard deviations of the noise."""
 MAX_OUTPUT_RANGE = 2.0
 """Largest range of PV under the relay, in permitted set-point steps."""
+OF_PV_LIMITS = 0.9
+"""Part of the way to the limits of PV to which a larger amplitude may take it."""
 MAX_PERIODS = 8.4
 MIN_MODEL_PERIOD = 0.5
 """Fraction of the relay's period below which the ultimate period of a model is not used."""
@@ -57,6 +59,7 @@ class RelayTest(Experiment):
     facts, point: what is known of the loop, and the operating point at rest.
     record: the samples so far, with which the record begins.
     amplitude: the amplitude of the relay's higher side, MV units; None for the default, adapted after the first wave.
+    begins_with: the amplitude with which the default begins where its own is not to be, MV units; it is adapted too.
     at_rest: the number of samples at rest at the beginning of the record, where the relay follows another excitation;
     None where it is the first one.
     Raises Refused, BAD_LIMITS: an amplitude that MV does not permit.
@@ -69,6 +72,7 @@ class RelayTest(Experiment):
         record: Trace,
         amplitude: float | None,
         at_rest: int | None = None,
+        begins_with: float | None = None,
     ) -> None:
         super().__init__(facts, point, record, at_rest)
         self._follows = at_rest is not None
@@ -81,7 +85,7 @@ class RelayTest(Experiment):
                 Reason.BAD_LIMITS, f"a relay amplitude of {amplitude:g} is asked for; MV permits up to {self._max:.4g}"
             )
         self._fixed = amplitude is not None
-        self.amplitude = amplitude or FIRST_AMPLITUDE * self._max
+        self.amplitude = amplitude or min(begins_with or math.inf, FIRST_AMPLITUDE * self._max)
         self._sides = [BIAS, 1.0]  # low, high, in amplitudes
         self._high = True
         self._raise_at = 0
@@ -203,13 +207,21 @@ class RelayTest(Experiment):
                 f"all the time (noise {self.noise:.3g} before)",
             )
         if seen < MIN_OUTPUT_RANGE * self.noise:
-            factor = min(GOOD_OUTPUT_RANGE * self.noise / seen, self._max / self.amplitude)
+            factor = min(GOOD_OUTPUT_RANGE * self.noise / seen, self._max / self.amplitude, self._pv_permits())
         elif seen > MAX_OUTPUT_RANGE * self.facts.sp_deviation:
             factor = max(MAX_OUTPUT_RANGE * self.facts.sp_deviation, MIN_OUTPUT_RANGE * self.noise) / seen
         if 0.8 < factor < 1.25:
             return ()
         self.amplitude *= factor
         return (self._relay_command(),)
+
+    def _pv_permits(self) -> float:
+        """How many times the first wave PV may move within its limits."""
+        wave, rest = self.trace.pv[self._begun :], self.point.pv
+        up, down = max(wave) - rest, rest - min(wave)
+        above, below = self.facts.pv_high - rest, rest - self.facts.pv_low
+        ways = [OF_PV_LIMITS * room / gone for room, gone in ((above, up), (below, down)) if gone > 0.0]
+        return max(1.0, min(ways, default=math.inf))
 
     def _relay_command(self) -> SetRelay:
         low, high = (self.amplitude * side for side in self._sides)

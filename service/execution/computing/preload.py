@@ -9,6 +9,7 @@ LOADED = (
     "loopwright.service.jobs.job_figures",
     "loopwright.service.api.report.paper",
     "loopwright.service.cli.main",  # the script `loopwright` imports it, and each process imports what the script does
+    "loopwright.service.execution.excursions",
     "loopwright.service.execution.rehearsals",
     "loopwright.service.execution.rehearsal",
     "loopwright.service.observing.observed",
