@@ -18,6 +18,7 @@ from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.fast.design import Aim, DesignSpec, OptimalGains, aim_of
 from loopwright.tuning.fast.design_trial import designed_on
+from loopwright.tuning.fast.options import weights_up_to
 from loopwright.tuning.fast.procedure import FAST
 from loopwright.tuning.fast.proposal import delayed
 from loopwright.tuning.fast.record_evaluation import evaluate_again
@@ -115,7 +116,10 @@ def asked_spec(row: Job, Ms: float) -> DesignSpec:
 
     aim = aim_of(str(row.request.get("aim", Aim.BALANCED)))
     derivative = bool(row.request.get("derivative"))
-    return DesignSpec(Ms, derivative, noise_gain=number("noise_gain"), aim=aim, mv_peak=number("mv_peak"))
+    weights = weights_up_to(number("setpoint_weight_max"))
+    return DesignSpec(
+        Ms, derivative, noise_gain=number("noise_gain"), aim=aim, mv_peak=number("mv_peak"), weights=weights
+    )
 
 
 def job_model(row: Job, events: Sequence[JobEvent]) -> FoundModel:

@@ -60,6 +60,9 @@ class DesignCurve(Figures):
     noise_gain: float | None = Field(
         default=None, description="Largest noise gain, percent per PV unit, as the job asked; null: no bound"
     )
+    setpoint_weight_max: float = Field(
+        default=1.0, description="Largest set-point weight b, as the job asked or loops.yaml permitted", examples=[1.0]
+    )
     num: list[float] = Field(description="Numerator of the model, highest power of s first, PV units per MV percent")
     den: list[float] = Field(description="Denominator of the model, highest power of s first")
     dead_time_s: float = Field(description="Dead time of the model, s")
@@ -130,6 +133,7 @@ def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> Desig
         aim=spec.aim,
         mv_peak=spec.mv_peak,
         noise_gain=spec.noise_gain,
+        setpoint_weight_max=spec.weights[1],
         num=list(model.num),
         den=list(model.den),
         dead_time_s=model.L,
