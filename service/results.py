@@ -250,6 +250,11 @@ class PerformanceView(Figures):
     Mt: float | None = Field(description="Maximum complementary sensitivity")
     GM: float | None = Field(description="Gain margin, ratio; null: no crossing")
     PM_deg: float | None = Field(description="Phase margin, degrees; null: no crossing")
+    delay_margin_s: float | None = Field(
+        default=None,
+        description="Further dead time at which the loop becomes unstable, s; null: there is none, or an earlier "
+        "version has computed it",
+    )
     noise_gain: float | None = Field(description="Immediate change of MV for a jump of PV, percent per PV unit")
     overshoot_pct: float | None = Field(description="Overshoot of a set-point step, percent")
     setpoint: StepPerformanceView | None = Field(description="Response to a unit step of the set-point")
