@@ -14,7 +14,7 @@ from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.analysis.stability import open_loop
 from loopwright.tuning.analysis.step_response import step_response
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import Model, Reals
+from loopwright.tuning.models import Model, Reals, sign
 from loopwright.tuning.reasons import Ended
 
 LOAD_PCT = 10.0
@@ -93,7 +93,8 @@ def _is_stable(model: Model, gains: Gains) -> bool:
 
 def _step(model: Model, gains: Gains, horizon_s: float, load: bool) -> Reals:
     found = step_response(model, gains, horizon_s, load=load)
-    return np.interp(np.linspace(0.0, horizon_s, POINTS), found.t, found.y)
+    turned = sign(model) if load else 1.0  # the response is of a plant of positive gain
+    return turned * np.interp(np.linspace(0.0, horizon_s, POINTS), found.t, found.y)
 
 
 def _settling(model: Model, gains: Gains, load: bool) -> float:

@@ -63,6 +63,12 @@ export function weight(gains) {
   return known(gains?.b) && gains.b !== 1 ? `, b ${significant(gains.b, 3)}` : "";
 }
 
+/** The set-point weight that was on the loop, where that of the gains proposed is larger and was not. @param {any} job @returns {number | null} */
+export function untriedWeight(job) {
+  const tried = job.verification?.b ?? 1;
+  return job.verification && known(job.new_gains?.b) && job.new_gains.b > Math.max(1, tried) ? tried : null;
+}
+
 /** @type {Record<string, string>} */
 const REASONS = {
   operator: "by an operator",
