@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, computed_field
 
 from loopwright.service.jsonable import JsonObject
 from loopwright.tuning.gains import Gains
@@ -16,6 +16,8 @@ DESIGNED = ("fast", "setpoint")
 FIVE_STAGE = "five-stage"
 """The name of the procedure of five stages, which requests without a method mean."""
 TYPED_IN = "typed in"
+TOLD_APART = 2.0
+"""Standard errors by which a pole has to lie away from zero, lest the plant be called integrating."""
 """The structure, or the source of the gain, of a model that a person has typed in."""
 
 
@@ -149,6 +151,20 @@ class TransferModelView(Figures):
     @property
     def typed_in(self) -> bool:
         return self.structure == TYPED_IN
+
+    @computed_field(  # type: ignore[prop-decorator]
+        description="Whether the plant integrates as far as the record shows: the pole nearest to zero is there, or "
+        "cannot be told from it"
+    )
+    @property
+    def integrating(self) -> bool:
+        last, error = self.den[-1], self.den_errors[-1] if self.den_errors else 0.0
+        return len(self.den) > 1 and abs(last) <= TOLD_APART * error
+
+    @property
+    def named(self) -> str:
+        """The structure in words."""
+        return f"integrating as far as the record shows ({self.structure})" if self.integrating else self.structure
 
     def process_model(self) -> TransferFunction:
         """The model as an object of `tuning`."""

@@ -361,7 +361,7 @@ def _model_rows(source: ReportSource, pv_unit: str) -> list[Row]:
     model = job.model
     if isinstance(model, TransferModelView):
         rows += [
-            ("structure", model.structure, False),
+            ("structure", model.named, False),
             ("dead time", n.with_unit(n.with_error(model.dead_time_s, model.dead_time_error_s), "s"), False),
             ("numerator", f"{n.list_with_errors(model.num, model.num_errors)} ({pv_unit}/%)", True),
             ("denominator", n.list_with_errors(model.den, model.den_errors), True),
