@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, computed_field
 
 from loopwright.service.jsonable import JsonObject
 from loopwright.tuning.gains import Gains
@@ -16,6 +16,8 @@ DESIGNED = ("fast", "setpoint")
 FIVE_STAGE = "five-stage"
 """The name of the procedure of five stages, which requests without a method mean."""
 TYPED_IN = "typed in"
+TOLD_APART = 2.0
+"""Standard errors by which a pole has to lie away from zero, lest the plant be called integrating."""
 """The structure, or the source of the gain, of a model that a person has typed in."""
 
 
@@ -150,6 +152,20 @@ class TransferModelView(Figures):
     def typed_in(self) -> bool:
         return self.structure == TYPED_IN
 
+    @computed_field(  # type: ignore[prop-decorator]
+        description="Whether the plant integrates as far as the record shows: the pole nearest to zero is there, or "
+        "cannot be told from it"
+    )
+    @property
+    def integrating(self) -> bool:
+        last, error = self.den[-1], self.den_errors[-1] if self.den_errors else 0.0
+        return len(self.den) > 1 and abs(last) <= TOLD_APART * error
+
+    @property
+    def named(self) -> str:
+        """The structure in words."""
+        return f"integrating as far as the record shows ({self.structure})" if self.integrating else self.structure
+
     def process_model(self) -> TransferFunction:
         """The model as an object of `tuning`."""
         return TransferFunction(tuple(self.num), tuple(self.den), self.dead_time_s)
@@ -250,6 +266,11 @@ class PerformanceView(Figures):
     Mt: float | None = Field(description="Maximum complementary sensitivity")
     GM: float | None = Field(description="Gain margin, ratio; null: no crossing")
     PM_deg: float | None = Field(description="Phase margin, degrees; null: no crossing")
+    delay_margin_s: float | None = Field(
+        default=None,
+        description="Further dead time at which the loop becomes unstable, s; null: there is none, or an earlier "
+        "version has computed it",
+    )
     noise_gain: float | None = Field(description="Immediate change of MV for a jump of PV, percent per PV unit")
     overshoot_pct: float | None = Field(description="Overshoot of a set-point step, percent")
     setpoint: StepPerformanceView | None = Field(description="Response to a unit step of the set-point")

@@ -118,7 +118,8 @@ ADVICE: dict[Reason, str] = {
     Reason.CONTROLLER_MISMATCH: "The controller does not do what its gains say: correct in its settings, or in the "
     "gains that are stored for it, what the message names, then retune.",
     Reason.DIVERGES: "PV ran away under the new gains, which were taken back: keep the present gains, and repeat.",
-    Reason.LOCKED: "Somebody has locked the loop: ask them, or unlock it (loopwright unlock TAG), then ask again.",
+    Reason.LOCKED: "Somebody has locked the loop: ask them, or unlock it on its page (or by loopwright unlock TAG), "
+    "then ask again.",
     Reason.NO_GAIN: "The loop is already tuned as well as asked: nothing needs to be done. For a faster or a more "
     "robust loop ask for another Ms, for a proposal all the same set propose_anyway.",
     Reason.PV_LIMIT: "PV reached its limit: permit less MV deviation, or widen the PV limits if it is safe.",
@@ -138,7 +139,8 @@ ADVICE: dict[Reason, str] = {
     Reason.DEVICE_WENT_BACK: "The controller ended the test by itself (lease, heartbeat): check this machine's load.",
     Reason.RESTORE_UNCONFIRMED: "The loop could not be read back after the test: look at the controller NOW.",
     Reason.COMPUTATION_LIMIT: "Look for a number in the model or the options that is far from any plant's (gain, time "
-    "constants, dead time against T95 and sample time), or permit more by the option of `loopwright serve` named.",
+    "constants, dead time against T95 and sample time), or have an administrator permit more by the option of "
+    "`loopwright serve` named.",
     Reason.COMPUTATION_LOST: "The system ended the computation, or had no room for it: see that the machine has memory "
     "left, then repeat.",
     Reason.INTERNAL: "This is a defect of Loopwright; please report it with the job's events.",

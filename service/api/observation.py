@@ -3,6 +3,7 @@ is kept."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Annotated
 
@@ -14,7 +15,8 @@ from loopwright.service.api.computed import computed
 from loopwright.service.api.routes import new_router
 from loopwright.service.errors import Conflict
 from loopwright.service.execution.computing.pool import Pool
-from loopwright.service.inputs.plausible import Gain, Time
+from loopwright.service.inputs.plausible import Gain, SetpointWeight, Time
+from loopwright.service.inputs.request import permitted_weight
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
 from loopwright.service.loops.shared_reading import SharedReading
@@ -22,6 +24,7 @@ from loopwright.service.observing.hearing import question
 from loopwright.service.observing.observed import ObservationView, Question, observed
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.fast.design import Aim, DesignSpec
+from loopwright.tuning.fast.options import weights_up_to
 
 
 def router(jobs: Jobs, readings: SharedReading[LoopState | None], listening: Listening, pool: Pool) -> APIRouter:
@@ -55,9 +58,13 @@ def router(jobs: Jobs, readings: SharedReading[LoopState | None], listening: Lis
         noise_gain: Annotated[
             Gain | None, Query(description="Largest noise gain, percent per PV unit, as in a retune")
         ] = None,
+        setpoint_weight_max: Annotated[
+            SetpointWeight | None,
+            Query(description="Largest set-point weight b of the gains, as in a retune; at most that of loops.yaml"),
+        ] = None,
     ) -> ObservationView:  # fmt: skip
         spec = DesignSpec(ms, derivative, noise_gain=noise_gain, aim=aim, settling_s=settling_s, mv_peak=mv_peak)
-        asked = await run_in_threadpool(asked_of, tag, spec)
+        asked = await run_in_threadpool(asked_of, tag, spec, setpoint_weight_max)
         found = await computed(pool, partial(observed, asked), http, lambda: jobs.stopping)
         return await run_in_threadpool(kept, found, asked)
 
@@ -66,9 +73,10 @@ def router(jobs: Jobs, readings: SharedReading[LoopState | None], listening: Lis
         jobs.knowledge.observed(found, asked.spec.Ms, asked.state.sample_time_s)
         return found.model_copy(update={"knowledge": jobs.knowledge.of(found.loop, asked.state.gains)})
 
-    def asked_of(tag: str, spec: DesignSpec) -> Question:
+    def asked_of(tag: str, spec: DesignSpec, setpoint_weight_max: float | None) -> Question:
         """The question, with everything that it needs from the loop and its history."""
         config, host = jobs.directory.owner(tag)
+        spec = replace(spec, weights=weights_up_to(permitted_weight(config, setpoint_weight_max)))
         state = readings.of(tag)
         if state is None:
             raise Conflict(f"loop {tag} belongs to the host {host}, which listens to it: ask there")

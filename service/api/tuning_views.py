@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from loopwright.service.curves import LoopCurves
 from loopwright.service.inputs.model_json import ModelForm, form_shown
 from loopwright.service.results import GainsView
 from loopwright.tuning.reasons import Reason
@@ -170,6 +171,10 @@ class AlternativeView(TunedView):
     ambiguity: float | None = Field(
         description="Largest difference of Ms on a candidate model that explains the record as well, only with `ms`; "
         "null: no record"
+    )
+    curves: LoopCurves | None = Field(
+        description="Steps and Nyquist curve of the gains on the model with half a sample of delay; null: there are no "
+        "gains, or their loop is not stable"
     )
 
 

@@ -15,13 +15,14 @@ from loopwright.service.api.computed import computed
 from loopwright.service.api.routes import new_router
 from loopwright.service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
 from loopwright.service.execution.computing.pool import Pool
-from loopwright.service.inputs.plausible import Gain, Time
+from loopwright.service.inputs.plausible import Gain, SetpointWeight, Time
 from loopwright.service.jobs.alternatives import alternatives, asked_spec, redesigned
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.stored_record import record_columns, stored_record
 from loopwright.service.offline import tunings
 from loopwright.service.results import DESIGNED
 from loopwright.tuning.fast.design import Aim
+from loopwright.tuning.fast.options import weights_up_to
 from loopwright.tuning.fast.procedure import FAST
 
 
@@ -93,17 +94,26 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
                 "job"
             ),
         ] = None,
+        setpoint_weight_max: Annotated[
+            SetpointWeight | None,
+            Query(
+                description="Largest set-point weight b of the gains; only with `ms`. The default is the option of the "
+                "job, else 1"
+            ),
+        ] = None,
     ) -> AlternativesView:  # fmt: skip
         own = {
             "derivative": derivative, "aim": aim, "settling_s": settling_s, "mv_peak": mv_peak,
-            "noise_gain": noise_gain,
+            "noise_gain": noise_gain, "setpoint_weight_max": setpoint_weight_max,
         }  # fmt: skip
         for name, given in own.items():
             if ms is None and given is not None:
                 raise tunings.BadTuning(f"{name} needs ms: give ms too")
         if ms is not None and method not in (None, FAST):
             raise tunings.BadTuning(f"ms is an option of fast, not of {method}: leave out ms or method")
-        options = {name: value for name, value in own.items() if value is not None}
+        options: dict[str, Any] = {name: value for name, value in own.items() if value is not None}
+        if "setpoint_weight_max" in options:
+            options["weights"] = weights_up_to(options.pop("setpoint_weight_max"))
         work = await run_in_threadpool(computation, job_id, method, ms, options)
         return AlternativesView.model_validate(await computed(pool, work, http, lambda: jobs.stopping))
 

@@ -15,6 +15,7 @@ from loopwright.service.cli.output import (
     AskedMvPeak,
     AskedNoiseGain,
     AskedSettling,
+    AskedWeight,
     Url,
     die,
     job_going_on,
@@ -225,6 +226,7 @@ def alternatives_of_job(
     settling_s: AskedSettling = None,
     mv_peak: AskedMvPeak = None,
     noise_gain: AskedNoiseGain = None,
+    setpoint_weight_max: AskedWeight = None,
     method: Annotated[str | None, typer.Option(help="Only this method.")] = None,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
@@ -234,7 +236,7 @@ def alternatives_of_job(
     client = Client(url)
     found = client.computed(
         f"{path_of(client, job_id)}/alternatives", ms=ms, derivative=wanted, aim=aim, settling_s=settling_s,
-        mv_peak=mv_peak, noise_gain=noise_gain, method=method,
+        mv_peak=mv_peak, noise_gain=noise_gain, setpoint_weight_max=setpoint_weight_max, method=method,
     )  # fmt: skip
     if as_json:
         print_json(found)

@@ -15,6 +15,7 @@ from loopwright.service.cli.output import (
     AskedMvPeak,
     AskedNoiseGain,
     AskedSettling,
+    AskedWeight,
     Url,
     die,
     print_json,
@@ -131,6 +132,7 @@ def observe(
     settling_s: AskedSettling = None,
     mv_peak: AskedMvPeak = None,
     noise_gain: AskedNoiseGain = None,
+    setpoint_weight_max: AskedWeight = None,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
 ) -> None:
@@ -143,7 +145,7 @@ def observe(
     path = f"/loops/{quote(tag, safe='')}/observation"
     found = Client(url).computed(
         path, ms=ms, derivative=str(derivative).lower(), aim=aim, settling_s=settling_s, mv_peak=mv_peak,
-        noise_gain=noise_gain,
+        noise_gain=noise_gain, setpoint_weight_max=setpoint_weight_max,
     )  # fmt: skip
     shown = parsed(ObservationView, found)
     if as_json:

@@ -21,6 +21,7 @@ from loopwright.service.cli.output import (
     AskedMvPeak,
     AskedNoiseGain,
     AskedSettling,
+    AskedWeight,
     Url,
     die,
     going_on,
@@ -325,6 +326,7 @@ def retune(
     settling_s: AskedSettling = None,
     mv_peak: AskedMvPeak = None,
     noise_gain: AskedNoiseGain = None,
+    setpoint_weight_max: AskedWeight = None,
     amplitude: Annotated[float | None, typer.Option(help="Relay amplitude for fast, percent of MV.")] = None,
     excitations: Annotated[
         str | None, typer.Option(help="What fast moves the loop by, of what loops.yaml permits: setpoint,relay,manual.")
@@ -361,7 +363,8 @@ def retune(
         "sp_deviation": sp_deviation, "mv_low": mv_low, "mv_high": mv_high, "dry_run": dry_run or None,
         "directions": directions, "sp_rate_max_per_s": sp_rate_max,
         "method": method, "ms": ms, "derivative": derivative or None, "aim": aim, "settling_s": settling_s,
-        "mv_peak": mv_peak, "noise_gain": noise_gain, "amplitude_pct": amplitude,
+        "mv_peak": mv_peak, "noise_gain": noise_gain, "setpoint_weight_max": setpoint_weight_max,
+        "amplitude_pct": amplitude,
         "excitations": excitations.split(",") if excitations else None,
         "careful": careful or None, "verify": None if verify else False, "propose_anyway": propose_anyway or None,
         "pattern": loop if many else None,
@@ -372,7 +375,10 @@ def retune(
         if many:
             die("--from takes one loop, not a pattern", 2)
         asked = 1.6 if ms is None and method is None else ms
-        wanted = {"aim": aim, "settling_s": settling_s, "mv_peak": mv_peak, "noise_gain": noise_gain}
+        wanted = {
+            "aim": aim, "settling_s": settling_s, "mv_peak": mv_peak, "noise_gain": noise_gain,
+            "setpoint_weight_max": setpoint_weight_max,
+        }  # fmt: skip
         body |= _other_gains(client, from_job, loop, method, asked, derivative, wanted)
     if preview:
         raise typer.Exit(0 if _previewed(client, path, body, alone=True, as_json=as_json) else 3)

@@ -78,7 +78,7 @@ def show_exported(found: ExportedView, console: Console) -> None:
     lines += _range(found)
     if found.model is not None:
         model = {name: getattr(found.model, name) for name in ("num", "den", "dead_time_s")}
-        lines.append(f"Model ({found.model.structure}): {describe(model)}.")
+        lines.append(f"Model ({found.model.named}): {describe(model)}.")
     for line in lines:
         console.print(line, highlight=False, soft_wrap=True)
     console.print(gains_table(found.present, found.proposed, "OP per PV"))

@@ -33,6 +33,10 @@ AskedNoiseGain = Annotated[
     float | None,
     typer.Option("--noise-gain", help="Largest immediate change of MV for a jump of PV, percent per PV unit."),
 ]
+AskedWeight = Annotated[
+    float | None,
+    typer.Option("--setpoint-weight-max", help="Largest set-point weight b of the gains, 0 to 2; default: 1."),
+]
 
 
 def user() -> str:

@@ -14,6 +14,7 @@ from loopwright.service.cli.output import (
     AskedMvPeak,
     AskedNoiseGain,
     AskedSettling,
+    AskedWeight,
     die,
     print_json,
     read_json_object,
@@ -36,6 +37,7 @@ def rehearse(
     settling_s: AskedSettling = None,
     mv_peak: AskedMvPeak = None,
     noise_gain: AskedNoiseGain = None,
+    setpoint_weight_max: AskedWeight = None,
     propose_anyway: Annotated[
         bool,
         typer.Option(
@@ -67,11 +69,11 @@ def rehearse(
 
     given = {
         "Ms": ms, "derivative": derivative or None, "aim": aim, "settling_s": settling_s, "mv_peak": mv_peak,
-        "noise_gain": noise_gain,
+        "noise_gain": noise_gain, "setpoint_weight_max": setpoint_weight_max,
     }  # fmt: skip
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if options and method not in ("fast", "setpoint"):
-        names = "--ms, --derivative, --aim, --settling-s, --mv-peak and --noise-gain"
+        names = "--ms, --derivative, --aim, --settling-s, --mv-peak, --noise-gain and --setpoint-weight-max"
         die(f"{names} are options of the methods fast and setpoint, not of {method}", 2)
     check_plot(plot)
     samples = RehearsedSamples()

@@ -68,6 +68,7 @@ class RehearsedJob:
     evidence: EvidenceView | None
     verification: VerificationView | None
     id: str = "of this rehearsal"
+    sample_time_s: float | None = None
 
 
 def rehearsed_job(found: Rehearsal, method: str) -> RehearsedJob:
@@ -86,4 +87,5 @@ def rehearsed_job(found: Rehearsal, method: str) -> RehearsedJob:
         new_gains=result.new_gains,
         evidence=fast.evidence if fast else None,
         verification=fast.verification if fast else None,
+        sample_time_s=None if found.plant is None else found.plant.sample_time_s,
     )

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from loopwright.service.inputs.plausible import Positive, Size, Time, Value, check_step
+from loopwright.service.inputs.plausible import Positive, SetpointWeight, Size, Time, Value, check_step
 from loopwright.service.inputs.validation import did_you_mean, listed, words
 from loopwright.service.inputs.webhooks import WebhookConfig, repeated_names
 
@@ -117,6 +117,7 @@ class LoopConfig(BaseModel):
     setpoint_from: who moves the set-point in normal operation, an operator or (remote) another controller.
     outer_loop: the tag of that controller.
     test: what a test may do to the loop.
+    setpoint_weight_max: the largest set-point weight b that gains are designed with; None: what a request says, or 1.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -137,6 +138,7 @@ class LoopConfig(BaseModel):
     outer_loop: Tag | None = None
     area: str | None = Field(default=None, min_length=1, max_length=64)
     test: PermittedTest = PermittedTest()
+    setpoint_weight_max: SetpointWeight | None = None
     notes: str = ""
 
     @model_validator(mode="after")

@@ -174,6 +174,7 @@ def _within(low: float, high: float, unit: str) -> AfterValidator:
     return AfterValidator(check)
 
 
+SetpointWeight = Annotated[float, Field(ge=0.0, le=2.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]

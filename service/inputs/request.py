@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import (
     BaseModel,
@@ -27,6 +27,7 @@ from loopwright.service.inputs.plausible import (
     Implausible,
     NotNegative,
     Positive,
+    SetpointWeight,
     Size,
     Time,
     check_dead_time,
@@ -37,7 +38,7 @@ from loopwright.service.inputs.plausible import (
 from loopwright.service.inputs.validation import branch, branch_of, did_you_mean
 from loopwright.tuning.experiments.primitives import Directions
 from loopwright.tuning.experiments.step_limits import not_kept
-from loopwright.tuning.fast.design import Aim
+from loopwright.tuning.fast.design import MAX_WEIGHT, Aim
 from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.procedure import FAST, FastOptions
@@ -220,9 +221,20 @@ class DesignRetune(_Retune):
         "for noise",
         examples=[2.0],
     )
+    setpoint_weight_max: SetpointWeight | None = Field(
+        default=None,
+        description="Largest set-point weight b of the gains, 0 to 2. The default is that of loops.yaml, which a "
+        "request may only lower; where loops.yaml names none, 1, as most controllers take no more",
+        examples=[1.5],
+    )
 
-    def _requirements(self) -> dict[str, float | None]:
-        return {"settling_s": self.settling_s, "mv_peak": self.mv_peak, "noise_gain": self.noise_gain}
+    def _design(self) -> dict[str, Any]:
+        """The options of the design, as `DesignOptions` has them."""
+        return {
+            "Ms": self.ms, "derivative": self.derivative, "aim": self.aim, "settling_s": self.settling_s,
+            "mv_peak": self.mv_peak, "noise_gain": self.noise_gain, "setpoint_weight_max": self.setpoint_weight_max,
+            "verify": self.verify, "propose_anyway": self.propose_anyway,
+        }  # fmt: skip
 
     @property
     def options(self) -> DesignOptions:
@@ -291,16 +303,7 @@ class FastRetune(DesignRetune):
         if self.start == "relay" and self.model is not None and not self.dry_run:
             raise ValueError("model is for start=design, or for a dry run: the relay finds its own")
         try:
-            self._options = FastOptions(
-                Ms=self.ms,
-                derivative=self.derivative,
-                aim=self.aim,
-                amplitude=self.amplitude_pct,
-                careful=self.careful,
-                verify=self.verify,
-                propose_anyway=self.propose_anyway,
-                **self._requirements(),
-            )
+            self._options = FastOptions(amplitude=self.amplitude_pct, careful=self.careful, **self._design())
         except Refused as refused:
             raise ValueError(refused.detail) from refused
         return self
@@ -323,10 +326,7 @@ class SetpointRetune(DesignRetune):
         if self.model is not None and not self.dry_run:
             raise ValueError("model is for a dry run: the pulses find their own; fast takes one with start=design")
         try:
-            self._options = DesignOptions(
-                Ms=self.ms, derivative=self.derivative, aim=self.aim, verify=self.verify,
-                propose_anyway=self.propose_anyway, **self._requirements(),
-            )  # fmt: skip
+            self._options = DesignOptions(**self._design())
         except Refused as refused:
             raise ValueError(refused.detail) from refused
         return self
@@ -578,6 +578,11 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
         problems.append(f"a relay of amplitude_pct {amplitude:g} moves nothing; at least {MIN_AMPLITUDE_PCT:g} %")
     test, refused = _narrow_test(loop, request)
     problems += refused
+    highest = loop.setpoint_weight_max
+    try:
+        highest = permitted_weight(loop, request.setpoint_weight_max if isinstance(request, DesignRetune) else None)
+    except BadLimits as error:
+        problems.append(str(error))
     deviation = request.sp_deviation or loop.sp_deviation
     if deviation > loop.sp_deviation:
         problems.append(
@@ -593,7 +598,23 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
         problems.append(str(error))
     if problems:
         return loop, problems
-    return loop.model_copy(update={**limits, "sp_deviation": deviation, "test": test}), []
+    permitted = {"sp_deviation": deviation, "test": test, "setpoint_weight_max": highest}
+    return loop.model_copy(update={**limits, **permitted}), []
+
+
+def permitted_weight(loop: LoopConfig, asked: float | None) -> float | None:
+    """The largest set-point weight of gains for this loop; None where neither file nor request names one.
+
+    asked: that of a request.
+    Raises BadLimits where the file permits less.
+    """
+    named = loop.setpoint_weight_max
+    if asked is not None and named is not None and asked > named:
+        raise BadLimits(
+            f"setpoint_weight_max {asked:g} is more than the {named:g} of loops.yaml: ask for at most {named:g}, or "
+            f"permit more in loops.yaml (up to {MAX_WEIGHT:g}) where the controller takes it"
+        )
+    return named if asked is None else asked
 
 
 def _narrow_test(loop: LoopConfig, request: RetuneRequest) -> tuple[PermittedTest, list[str]]:

@@ -51,7 +51,7 @@ class NotHome:
             advice = "Look at the controller; it is looked at again by itself."
         return (
             f"not confirmed home after job {self.job_id}: {self.detail.removeprefix('not confirmed: ')}. {advice} "
-            f"If it is as it should be: loopwright dismiss {self.loop}"
+            f"If it is as it should be, sign its alarm off (on a command line: loopwright dismiss {self.loop})"
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from loopwright.service.curves import horizons, loop_curves
 from loopwright.service.errors import Conflict
 from loopwright.service.inputs.model_json import dump_model, parse_model
 from loopwright.service.jobs.stored_record import StoredRecord
@@ -18,9 +19,11 @@ from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.fast.design import Aim, DesignSpec, OptimalGains, aim_of
 from loopwright.tuning.fast.design_trial import designed_on
+from loopwright.tuning.fast.options import weights_up_to
 from loopwright.tuning.fast.procedure import FAST
 from loopwright.tuning.fast.proposal import delayed
 from loopwright.tuning.fast.record_evaluation import evaluate_again
+from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Ended, Reason, Refused
 from loopwright.tuning.rules.design import MIN_GM, MAX_Ms
@@ -56,8 +59,10 @@ def alternatives(row: Job, events: Sequence[JobEvent], method: str | None = None
     names = [method] if method else [name for name, each in METHODS.items() if not each.slow]
     results = tune_each(model, names)
     body = answer(model, results)
+    Ts = _sample_time_s(row)
     for each, shown in zip(results, body["methods"], strict=True):
-        shown |= {"retune": _retune(each, model), "uncertainty": None, "ambiguity": None}
+        curves = _curves(row, delayed(model, 0.5 * Ts), each.gains, Ts)
+        shown |= {"retune": _retune(each, model), "uncertainty": None, "ambiguity": None, "curves": curves}
     return json_object({"job": row.id, "loop": row.loop, **body})
 
 
@@ -69,6 +74,7 @@ def redesigned(row: Job, events: Sequence[JobEvent], record: StoredRecord | None
     Raises Conflict as `alternatives` does; a record is evaluated again.
     """
     doubt: dict[str, float | None] = {"uncertainty": None, "ambiguity": None}
+    Ts = _sample_time_s(row)
     evidence = record.experiment_record() if record and row.request.get("method") in DESIGNED else None
     model = designable(row, events, evidence is not None)
     try:
@@ -80,19 +86,31 @@ def redesigned(row: Job, events: Sequence[JobEvent], record: StoredRecord | None
                 raise Refused(evaluation.reason, evaluation.detail)
             sampled: Model = delayed(model, evaluation.design_delay)
         else:
-            Ts = loop_state(row.found).sample_time_s if row.found else 0.0
             sampled = delayed(model, 0.5 * Ts)
             best = designed_on(model, spec, Ts)
         result = _tuned(best, spec, assess(sampled, best.gains))
     except Ended as refusal:
         result = MethodResult(FAST_DESIGN, refusal=refusal)
     body = answer(model, [result])
-    retune = None
+    retune = curves = None
     if result.gains is not None:
+        curves = _curves(row, sampled, result.gains, Ts)
         asked = {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
         retune = json_object({"method": FAST, "start": "design", **options_of(spec), "model": asked} | ANYWAY)
-    body["methods"][0] |= {"retune": retune, **doubt}
+    body["methods"][0] |= {"retune": retune, **doubt, "curves": curves}
     return json_object({"job": row.id, "loop": row.loop, **body})
+
+
+def _sample_time_s(row: Job) -> float:
+    return loop_state(row.found).sample_time_s if row.found else 0.0
+
+
+def _curves(row: Job, sampled: Model, gains: Gains | None, Ts: float) -> JsonObject | None:
+    """Returns the curves of gains on the model with the delay of the sampling, as long as those of the job's own."""
+    if gains is None:
+        return None
+    found = loop_curves(sampled, gains, horizons(sampled, (new_gains(row), gains), Ts), Ts)
+    return None if found is None else json_object(found.model_dump())
 
 
 def options_of(spec: DesignSpec) -> dict[str, bool | float | str]:
@@ -115,7 +133,15 @@ def asked_spec(row: Job, Ms: float) -> DesignSpec:
 
     aim = aim_of(str(row.request.get("aim", Aim.BALANCED)))
     derivative = bool(row.request.get("derivative"))
-    return DesignSpec(Ms, derivative, noise_gain=number("noise_gain"), aim=aim, mv_peak=number("mv_peak"))
+    weights = weights_up_to(number("setpoint_weight_max"))
+    return DesignSpec(
+        Ms, derivative, noise_gain=number("noise_gain"), aim=aim, mv_peak=number("mv_peak"), weights=weights
+    )
+
+
+def new_gains(row: Job) -> Gains | None:
+    """Returns the gains of the result of a job; None where it has none."""
+    return None if row.result is None or row.result.new_gains is None else row.result.new_gains.gains()
 
 
 def job_model(row: Job, events: Sequence[JobEvent]) -> FoundModel:

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 
 from pydantic import AliasChoices, Field
 
-from loopwright.service.jobs.alternatives import asked_spec
+from loopwright.service.curves import Horizons, LoopCurves, horizons, loop_curves
+from loopwright.service.jobs.alternatives import asked_spec, new_gains
 from loopwright.service.jsonable import json_object
 from loopwright.service.results import Figures, GainsView, PerformanceView
 from loopwright.service.states.loop_state import gains_of, loop_state
 from loopwright.service.store.jobs import Job
-from loopwright.tuning.analysis.comparison import loop_performance
+from loopwright.tuning.analysis.comparison import beside, loop_performance
 from loopwright.tuning.fast.design import Aim, DesignSpec, GainDesign
 from loopwright.tuning.fast.design_trial import designed_on
 from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation
@@ -40,6 +41,12 @@ class DesignPoint(Figures):
         validation_alias=AliasChoices("performance", "worth"),  # jobs of 0.1.0's development are stored with the latter
         description="Performance of the gains on the model; null: there are no gains",
     )
+    beside: str | None = Field(
+        default=None, description="How the gains compare with those before the job, in a sentence; null: not known"
+    )
+    curves: LoopCurves | None = Field(
+        default=None, description="Steps and Nyquist curve of the gains; null: there are no gains"
+    )
     reason: Reason | None = Field(description="Why there are no gains; reason code from the closed list")
     detail: str | None = Field(description="The numbers behind the reason")
     advice: str | None = Field(description="What the operator should do about the reason")
@@ -60,6 +67,9 @@ class DesignCurve(Figures):
     noise_gain: float | None = Field(
         default=None, description="Largest noise gain, percent per PV unit, as the job asked; null: no bound"
     )
+    setpoint_weight_max: float = Field(
+        default=1.0, description="Largest set-point weight b, as the job asked or loops.yaml permitted", examples=[1.0]
+    )
     num: list[float] = Field(description="Numerator of the model, highest power of s first, PV units per MV percent")
     den: list[float] = Field(description="Denominator of the model, highest power of s first")
     dead_time_s: float = Field(description="Dead time of the model, s")
@@ -68,6 +78,15 @@ class DesignCurve(Figures):
     )
     before: PerformanceView | None = Field(description="Performance of the gains before the job; null: not known")
     after: PerformanceView | None = Field(description="Performance of the gains of the job; null: it has none")
+    before_curves: LoopCurves | None = Field(
+        default=None, description="Steps and Nyquist curve of the gains before; null: not known, or not stable"
+    )
+    after_curves: LoopCurves | None = Field(
+        default=None, description="Steps and Nyquist curve of the gains of the job; null: it has none"
+    )
+    after_beside: str | None = Field(
+        default=None, description="How the gains of the job compare with those before, in a sentence; null: not known"
+    )
     designs: list[DesignPoint] = Field(description="One entry for each Ms, in rising order")
 
 
@@ -77,6 +96,7 @@ class _Designing:
 
     model: with the delay of the sampling in its dead time.
     Ts: the sample time, s.
+    before, ends: the performance of the gains before the job, and the lengths of the curves, once they are known.
     """
 
     model: Model
@@ -84,6 +104,8 @@ class _Designing:
     gains: Callable[[float], Gains]
     uncertainty: Callable[[Gains], float | None]
     largest: float
+    before: PerformanceView | None = None
+    ends: Horizons = (1.0, 1.0)
 
     def point(self, Ms: float) -> DesignPoint:
         try:
@@ -93,14 +115,21 @@ class _Designing:
                 raise Refused(Reason.UNCERTAIN, f"Ms of these gains is known to +-{unsure:.2g} only")
         except Ended as refusal:
             return _refused(Ms, refusal)
+        performance = self.performance(gains)
         return DesignPoint(
-            Ms_asked=Ms, gains=GainsView.of(gains), uncertainty=unsure, performance=self.performance(gains),
-            reason=None, detail=None, advice=None,
+            Ms_asked=Ms, gains=GainsView.of(gains), uncertainty=unsure, performance=performance,
+            beside=self.beside(performance), curves=self.curves(gains), reason=None, detail=None, advice=None,
         )  # fmt: skip
 
     def performance(self, gains: Gains) -> PerformanceView:
         found = json_object(loop_performance(self.model, gains, self.Ts))
         return PerformanceView.model_validate(found)
+
+    def beside(self, after: PerformanceView | None) -> str | None:
+        return None if self.before is None or after is None or not after.stable else beside(self.before, after)
+
+    def curves(self, gains: Gains | None) -> LoopCurves | None:
+        return None if gains is None else loop_curves(self.model, gains, self.ends, self.Ts)
 
 
 def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> DesignCurve:
@@ -117,25 +146,31 @@ def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> Desig
         Ts = loop_state(row.found).sample_time_s if row.found else 0.0
         designing = _on_model(model, Ts, spec)
         delay_s, words = 0.5 * Ts, "the job's model"
+    old, new = None if not row.old_gains else gains_of(row.old_gains), new_gains(row)
+    before, after = (None if each is None else designing.performance(each) for each in (old, new))
+    ends = horizons(designing.model, (new, old), designing.Ts)
+    designing = replace(designing, before=before, ends=ends)
     if evaluation is not None and evaluation.reason is not None:
         refusal = Refused(evaluation.reason, evaluation.detail)
         points = [_refused(Ms, refusal) for Ms in GRID]
     else:
         points = [designing.point(Ms) for Ms in GRID]
-    old = None if not row.old_gains else gains_of(row.old_gains)
-    new = None if row.result is None or row.result.new_gains is None else row.result.new_gains.gains()
     return DesignCurve(
         designed_on=words,
         derivative=spec.derivative,
         aim=spec.aim,
         mv_peak=spec.mv_peak,
         noise_gain=spec.noise_gain,
+        setpoint_weight_max=spec.weights[1],
         num=list(model.num),
         den=list(model.den),
         dead_time_s=model.L,
         sampling_delay_s=delay_s,
-        before=None if old is None else designing.performance(old),
-        after=None if new is None else designing.performance(new),
+        before=before,
+        after=after,
+        before_curves=designing.curves(old),
+        after_curves=designing.curves(new),
+        after_beside=designing.beside(after),
         designs=points,
     )
 

@@ -25,7 +25,7 @@ from loopwright.tuning.reasons import Ended
 
 log = logging.getLogger(__name__)
 
-VERSION = 1
+VERSION = 2
 """Version of this computation. What another version has stored is computed anew."""
 _HIGHEST_MS = 2.0
 

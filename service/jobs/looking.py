@@ -10,7 +10,7 @@ import logging
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -31,6 +31,7 @@ from loopwright.service.observing.observed import observed
 from loopwright.service.observing.resolution import FIRST_S, wall_period_s
 from loopwright.service.store.store import Store
 from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.options import weights_up_to
 from loopwright.tuning.models import Reals
 from loopwright.tuning.reasons import Ended
 
@@ -153,7 +154,8 @@ class Looking:
     def _look(self, config: LoopConfig) -> bool:
         """Looks at one loop. Returns False where the set-point changes have to be looked at again. Raises Ended."""
         state, disturbers = self._directory.read(config.tag), self._directory.disturbers(config.tag)
-        asked = question(self._listening, self._store, config, state, self._spec, disturbers, self._wall)
+        spec = replace(self._spec, weights=weights_up_to(config.setpoint_weight_max))
+        asked = question(self._listening, self._store, config, state, spec, disturbers, self._wall)
         try:
             found = self._pool.run(
                 ComputationKind.LOOK,

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from loopwright.service.errors import NotKnown, Stopping
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import RetuneRequest, check_setpoint_source, within
+from loopwright.service.inputs.request import DesignRetune, RetuneRequest, check_setpoint_source, within
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.aftercare import Aftercare
 from loopwright.service.jobs.carrying_out import CarryingOut
@@ -181,10 +181,13 @@ class Jobs:
         also: writes in the same transaction; when it raises, there is no job.
         """
         config, host = self.directory.owner(tag)
-        check_setpoint_source(within(config, request), request)
+        narrowed = within(config, request)
+        check_setpoint_source(narrowed, request)
         if self.stopping:
             raise Stopping(self.why_stopping)
         asked = request.asked()
+        if isinstance(request, DesignRetune) and narrowed.setpoint_weight_max is not None:
+            asked["setpoint_weight_max"] = narrowed.setpoint_weight_max  # it stays with the job
         made: list[Job] = []
 
         def make(session: Session, row: JobRow) -> None:

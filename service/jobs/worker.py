@@ -7,6 +7,7 @@ reports go to the journal, which another thread writes.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Unpack
@@ -39,6 +40,7 @@ from loopwright.service.loops.restoration import restore_abandoned
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.planning.known_loop import known
 from loopwright.service.planning.t95 import t95_mismatch
+from loopwright.service.results import TransferModelView
 from loopwright.service.states.job_state import ACTIVE, GOOD, IllegalMove, JobState, state_after
 from loopwright.service.states.loop_state import LoopState, differences, loop_state, same_gains, state_json
 from loopwright.service.store import looked_after
@@ -156,7 +158,10 @@ class Worker:
         it."""
         try:
             model = None if outcome.result is None else outcome.result.model
-            if model is not None and (text := t95_mismatch(model.process_model(), config.t95_s)):
+            if model is None or (isinstance(model, TransferModelView) and model.integrating):
+                return
+            record_s = sum(outcome.plant_time_s.values()) or math.inf
+            if text := t95_mismatch(model.process_model(), config.t95_s, record_s):
                 running.on_event(Note(text))
         except Exception:
             log.exception("T95 could not be compared with the model found")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from loopwright.protocol.profile import Cause, OutsideChange, node_name
+from loopwright.protocol.profile import Cause, OutsideChange, RelayState, node_name
 from loopwright.protocol.real32 import same
 from loopwright.protocol.tuner import Tuner
 from loopwright.service.loops.bus_reading import BusReading
@@ -50,7 +50,7 @@ def why_over(reading: BusReading, number: int, pv_silence_s: float) -> Ended:
             reason = moved[0][0] if moved else Reason.MODE_CHANGED
             return Aborted(reason, f"an operator or another master changed: {', '.join(name for _, name, _ in moved)}")
         case Cause.PV_LIMIT:
-            return Failed(Reason.PV_LIMIT, "PV left its limits; the controller ended the test")
+            return Failed(Reason.PV_LIMIT, f"{_pv_left(tuner)}; the controller ended the test")
         case Cause.NO_PV:
             reading.check_plant_operational()
             text = f"the controller has had no valid PV for {pv_silence_s:g} s"
@@ -62,6 +62,13 @@ def why_over(reading: BusReading, number: int, pv_silence_s: float) -> Ended:
     if cause is Cause.LEASE:
         text += f"; at most {tuner.longest_between_renewals_s:.1f} s passed between two renewals of the lease"
     return Failed(Reason.DEVICE_WENT_BACK, text)
+
+
+def _pv_left(tuner: Tuner) -> str:
+    """Returns which limits PV has left, with PV as it is read, which is a little later."""
+    by_relay = int(tuner.number("controller_relay_state")) == RelayState.ENDED_BY_LIMIT
+    low, high = (tuner.number(f"controller_{'relay' if by_relay else 'session'}_pv_{end}") for end in ("low", "high"))
+    return f"PV left {low:.5g} .. {high:.5g} and is {tuner.number('controller_received_pv'):.5g} now"
 
 
 def read_back(reading: BusReading, home: LoopState, number: int, how: str) -> Restored:

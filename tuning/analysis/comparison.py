@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 from loopwright.tuning.analysis.assessment import assess
 from loopwright.tuning.analysis.step_figures import StepFigures
@@ -55,6 +56,7 @@ class LoopPerformance:
     Ms, Mt: the peaks of |1/(1+L)| and |L/(1+L)|.
     GM: the gain margin, a ratio; None where there is no phase crossover.
     PM_deg: the phase margin, degrees; None where there is no gain crossover.
+    delay_margin_s: the further dead time at which the loop becomes unstable, s; None where there is none.
     noise_gain: the answer of MV to a jump of PV, MV units per PV unit.
     overshoot_pct: the overshoot after a set-point step, percent.
     setpoint, load: the figures of the set-point step and of the load disturbance.
@@ -70,6 +72,28 @@ class LoopPerformance:
     overshoot_pct: float | None = None
     setpoint: StepPerformance | None = None
     load: StepPerformance | None = None
+    delay_margin_s: float | None = None
+
+
+class _HasIAE(Protocol):
+    @property
+    def IAE(self) -> float | None: ...
+
+
+class _Compared(Protocol):
+    """The part of a `LoopPerformance` that a sentence compares."""
+
+    @property
+    def stable(self) -> bool: ...
+
+    @property
+    def Ms(self) -> float | None: ...
+
+    @property
+    def setpoint(self) -> _HasIAE | None: ...
+
+    @property
+    def load(self) -> _HasIAE | None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,15 +192,18 @@ class Predicted:
     IAE_per_unit: float | None
 
 
+def as_sampled(gains: Gains, sample_time_s: float) -> Gains:
+    """The gains as a controller of this sample time (s) carries them out: an ideal derivative is a difference over one
+    sample, which lags by half of it."""
+    return replace(gains, Tf=0.5 * sample_time_s) if gains.Td > 0.0 and gains.Tf == 0.0 else gains
+
+
 def loop_performance(model: Model, gains: Gains, sample_time_s: float = 0.0) -> LoopPerformance:
     """The figures of these gains on this model, whose dead time includes the delay of the sampling.
 
     An ideal derivative is taken as a controller of this sample time (s) carries it out.
     """
-    realised = gains
-    if gains.Td > 0.0 and gains.Tf == 0.0:
-        # a difference over one sample lags by half of it
-        realised = replace(gains, Tf=0.5 * sample_time_s)
+    realised = as_sampled(gains, sample_time_s)
     try:
         found = assess(model, realised, band=BAND)
     except Ended:  # its response leaves all bounds
@@ -200,6 +227,7 @@ def loop_performance(model: Model, gains: Gains, sample_time_s: float = 0.0) -> 
         overshoot_pct=setpoint.overshoot_pct,
         setpoint=_step(setpoint, offset and not integrators(model)),
         load=_step(load, offset),
+        delay_margin_s=m.delay_margin_s,
     )
 
 
@@ -278,6 +306,14 @@ def _conclusion(
     return False, rest
 
 
+def beside(before: _Compared, after: _Compared) -> str:
+    """How gains, which are stable, compare with those before a test: a sentence that holds whichever are in effect."""
+    if not before.stable:
+        return f"The gains before are not stable on this model; these have Ms {after.Ms:.2f}."
+    errors = _errors(before, after)
+    return f"Beside the gains before, {errors}; Ms {before.Ms:.2f} before, {after.Ms:.2f} with these gains."
+
+
 def _worse_setpoint(before: LoopPerformance, after: LoopPerformance, asked: RobustnessBounds) -> str | None:
     """By how much the new gains raise the IAE after a set-point step, in words, where the present gains keep all bounds
     and that is more than 5 %; None elsewhere."""
@@ -289,7 +325,7 @@ def _worse_setpoint(before: LoopPerformance, after: LoopPerformance, asked: Robu
     return f"{100.0 * (then / now - 1.0):.0f} % of IAE"
 
 
-def _errors(before: LoopPerformance, after: LoopPerformance) -> str:
+def _errors(before: _Compared, after: _Compared) -> str:
     assert before.load and after.load and before.setpoint and after.setpoint
     load, setpoint = (_change(a.IAE, b.IAE) for a, b in ((before.load, after.load), (before.setpoint, after.setpoint)))
     return f"load disturbances are corrected with {load} integral error (IAE), steps of the set-point with {setpoint}"

@@ -48,10 +48,12 @@ MAX_TD = 2.0  # Td as a multiple of Ti
 PID_STEPS = 45
 MAX_J_RATIO = 0.97
 """The PID is taken only if its J is below this fraction of the J of the best PI."""
-WEIGHTS = (0.0, 2.0)
-"""The smallest and the largest set-point weight b. The best b is above one where the dead time is longer than the lags,
-or where the Ms asked for is small: Kp is then so small that b*Kp moves MV about as far as it has to go in the end. The
-controller's object dictionary limits b neither way."""
+WEIGHTS = (0.0, 1.0)
+"""The smallest and the largest set-point weight b, unless another is permitted: most controllers hold b at 0 to 1."""
+MAX_WEIGHT = 2.0
+"""The largest set-point weight that may be permitted. The best b is above one where the dead time is longer than the
+lags, or where the Ms asked for is small: Kp is then so small that b*Kp moves MV about as far as it has to go in the
+end."""
 MAX_OVERSHOOT = 0.01
 """Largest overshoot of the aim no_overshoot on the model, as a fraction of the set-point step."""
 WIDER_OVERSHOOTS, MAX_PRICE = (0.02, 0.05), 1.5
@@ -147,8 +149,13 @@ class DesignSpec:
 
     @property
     def requirements(self) -> dict[str, float]:
-        """What is asked for beside Ms and Mt: settling_s, mv_peak and noise_gain, as far as they are."""
-        asked = {"settling_s": self.settling_s, "mv_peak": self.mv_peak, "noise_gain": self.noise_gain}
+        """What is asked for beside Ms and Mt: settling_s, mv_peak and noise_gain as far as they are, and
+        setpoint_weight_max where it is not that of WEIGHTS."""
+        highest = self.weights[1]
+        asked = {
+            "settling_s": self.settling_s, "mv_peak": self.mv_peak, "noise_gain": self.noise_gain,
+            "setpoint_weight_max": None if highest == WEIGHTS[1] else highest,
+        }  # fmt: skip
         return {name: value for name, value in asked.items() if value is not None}
 
 

@@ -379,6 +379,11 @@ def proposed(
         )
     if (note := note_of(evaluation)) is not None:
         notes.append(note)
+    if verified is not None and gains.b > max(1.0, verified.tested.b):
+        notes.append(
+            f"The step was made with a set-point weight b of {verified.tested.b:.3g}: b {gains.b:.3g} of these gains "
+            "was not tried on this loop, and moves MV further at each set-point step."
+        )
     if found.drift:
         notes.append("PV drifted at a steady rate during the test; this was allowed for.")
     return FastProposal(

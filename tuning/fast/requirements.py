@@ -18,13 +18,13 @@ Both are judged by the exact response of the continuous loop, as the comparison 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopwright.tuning.analysis.comparison import BAND
-from loopwright.tuning.fast.design import MAX_PRICE, WIDER_OVERSHOOTS, GainDesign, OptimalGains
+from loopwright.tuning.fast.design import MAX_PRICE, MAX_WEIGHT, WIDER_OVERSHOOTS, GainDesign, OptimalGains
 from loopwright.tuning.fast.iae import Cost
 from loopwright.tuning.fast.weight_bounds import KEPT, DesignBounds, Missed
 from loopwright.tuning.models import Model, integrators
@@ -35,8 +35,8 @@ LOWEST_MS, HIGHEST_MS = 1.1, 2.0
 LEVELS, HALVINGS, REFINEMENTS = 5, 5, 2
 """Number of values of Ms that are tried where the one asked for does not do, of halvings of an interval of Ms, and of
 steps of half the distance between two values."""
-MS_STEP = 0.05
-"""Step of the values of Ms that are named as what would do."""
+STEP = 0.05
+"""Step of the values of Ms, and of the set-point weight b, that are named as what would do."""
 TIGHTENINGS, MARGIN = 3, 0.998
 """How often a bound of the simulated response is tightened because the exact response misses it, and by how much more
 than it misses it by."""
@@ -323,22 +323,40 @@ def _others(design: GainDesign) -> Iterator[str]:
             peak = _up(reached.mv_peak)
             if _RequirementSearch(design, replace(search.bounds, mv_peak=peak)).found() is not None:
                 yield f"for a movement of MV of {peak:g}"
+    if (b := _sufficient_weight(design, search.bounds)) is not None:
+        yield f"for a set-point weight b of {b:g}, where the controller takes it (setpoint_weight_max)"
 
 
 def _sufficient_Ms(search: _RequirementSearch) -> float | None:
-    """The smallest multiple of MS_STEP, up to HIGHEST_MS, that permits the settling time; None for none."""
+    """The smallest multiple of STEP, up to HIGHEST_MS, that permits the settling time; None for none."""
 
-    def permits(steps: int) -> bool:
-        found = search.at(round(steps * MS_STEP, 2))
+    def permits(Ms: float) -> bool:
+        found = search.at(Ms)
         return found is not None and found.kept
 
-    low, high = math.floor(search.bounds.Ms / MS_STEP + 1e-9), round(HIGHEST_MS / MS_STEP)
-    if high <= low or not permits(high):
+    return _smallest(permits, search.bounds.Ms, HIGHEST_MS)
+
+
+def _sufficient_weight(design: GainDesign, bounds: DesignBounds) -> float | None:
+    """The smallest multiple of STEP, up to MAX_WEIGHT, that permits the settling time as the largest set-point weight;
+    None for none."""
+
+    def permits(b: float) -> bool:
+        spec = replace(design.spec, weights=(design.spec.weights[0], b))
+        return _RequirementSearch(GainDesign(design.model, spec, design.period), bounds).found() is not None
+
+    return _smallest(permits, design.spec.weights[1], MAX_WEIGHT)
+
+
+def _smallest(permits: Callable[[float], bool], above: float, highest: float) -> float | None:
+    """The smallest multiple of STEP above a value, up to the highest, that permits what is asked for; None for none."""
+    low, high = math.floor(above / STEP + 1e-9), round(highest / STEP)
+    if high <= low or not permits(highest):
         return None
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if permits(middle) else (middle, high)
-    return round(high * MS_STEP, 2)
+        low, high = (low, middle) if permits(round(middle * STEP, 2)) else (middle, high)
+    return round(high * STEP, 2)
 
 
 def _up(value: float) -> float:

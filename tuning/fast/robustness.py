@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from loopwright.tuning.analysis.comparison import as_sampled
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.fast.design import frequencies
 from loopwright.tuning.fast.evaluation import Evaluation
-from loopwright.tuning.fast.uncertainty import difference_of_rivals, filter_ratio, peak, uncertainty_of_Ms
+from loopwright.tuning.fast.uncertainty import difference_of_rivals, filter_ratio, uncertainty_of_Ms
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Refused
 
@@ -24,14 +25,14 @@ class KnownMs:
 def known_Ms(evaluation: Evaluation, gains: Gains) -> KnownMs:
     """Ms of these gains on the model of an evaluation, with its uncertainty."""
     delay = evaluation.design_delay
-    model = evaluation.model
-    try:
-        stable = margins(replace(model, L=model.L + delay), gains).stable
+    model = replace(evaluation.model, L=evaluation.model.L + delay)
+    try:  # as the comparison of old and new gains has it
+        found = margins(model, as_sampled(gains, evaluation.fit.record.Ts))
     except Refused:  # gains that the analysis does not take, of a controller that works all the same
-        stable = False
-    if not stable:
+        return KnownMs(None, None)
+    if not found.stable:
         return KnownMs(None, None)
     fit, chosen, w = evaluation.fit, evaluation.chosen, frequencies(evaluation.period)
     spread = uncertainty_of_Ms(fit, chosen.best, gains, w, filter_ratio(gains), delay)
     rivals = difference_of_rivals(fit, chosen.best, chosen.rivals, gains, w, delay)
-    return KnownMs(peak(model, gains, w, delay), max(spread, rivals))
+    return KnownMs(found.Ms, max(spread, rivals))

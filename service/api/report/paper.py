@@ -22,6 +22,7 @@ from loopwright.service.api.report.words import (
     stage_name,
     trust,
 )
+from loopwright.service.curves import LOAD_PCT, LoopCurves, horizons, loop_curves
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.jobs.design_curve import DesignCurve
 from loopwright.service.jobs.job_record import FITTED, JobRecord
@@ -29,9 +30,9 @@ from loopwright.service.results import GainsView, PerformanceView, StepPerforman
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store.jobs import JobEvent
 from loopwright.service.store.sample_blocks import Block
+from loopwright.tuning.analysis.comparison import beside
 from loopwright.tuning.fast.proposal import delayed
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import Model, TransferFunction
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -76,12 +77,12 @@ def paper(source: ReportSource) -> str:
     job, loop = source.job, source.loop
     pv_unit = "PV units" if loop is None else n.unit(loop.pv_unit)
     old, new = job.old_gains, job.new_gains
-    model, before, after = _model(source), _performance(source, False), _performance(source, True)
+    before, after = _performance(source, False), _performance(source, True)
     size = _step_size(source)
     Ms = after.Ms if after is not None else before.Ms if before is not None else None
-    steps = None
-    if model is not None and (old is not None or new is not None):
-        steps = step_pictures(model, _gains(old), _gains(new), size, Ms)
+    old_curves, new_curves = _curves(source)
+    unstable = old_curves is None and before is not None and not before.stable
+    steps = step_pictures(old_curves, new_curves, size, Ms, unstable)
     record = None if source.record is None else record_pictures(source.record, size)
     decimals = 3 if loop is None else n.pv_decimals(loop.pv_limits.low, loop.pv_limits.high)
     return _template().render(
@@ -95,7 +96,7 @@ def paper(source: ReportSource) -> str:
         description="" if loop is None else loop.description,
         head=_head(source),
         trust=" ".join(trust(job)),
-        verdict=sentence(None if job.comparison is None else job.comparison.verdict),
+        verdict=sentence(_verdict(job)),
         decided=f"{_decided(job, source.events)} {_afterwards(job, decimals, pv_unit)}".strip(),
         table=_table(old, new, before, after, job, pv_unit),
         has_before=old is not None,
@@ -145,18 +146,31 @@ def _template() -> Template:
     return environment.get_template("report.html")
 
 
+def _verdict(job: JobView) -> str | None:
+    """The comparison in a sentence. That of the job's end speaks of the present gains, which are others after an
+    acceptance."""
+    if (compared := job.comparison) is None:
+        return None
+    if job.state in (JobState.ACCEPTED, JobState.ROLLED_BACK) and compared.after.stable:
+        return beside(compared.before, compared.after)
+    return compared.verdict
+
+
 def _gains(view: GainsView | None) -> Gains | None:
     return None if view is None else view.gains()
 
 
-def _model(source: ReportSource) -> Model | None:
-    """The model with the delay of the sampling in its dead time."""
+def _curves(source: ReportSource) -> tuple[LoopCurves | None, LoopCurves | None]:
+    """What the gains before and after do: as computed with the designs, else on the job's model."""
     if (designs := source.designs) is not None:
-        dead_time = designs.dead_time_s + designs.sampling_delay_s
-        return TransferFunction(tuple(designs.num), tuple(designs.den), dead_time)
-    if source.job.model is None:
-        return None
-    return delayed(source.job.model.process_model(), 0.5 * (source.job.sample_time_s or 0.0))
+        return designs.before_curves, designs.after_curves
+    job, Ts = source.job, source.job.sample_time_s or 0.0
+    if job.model is None:
+        return None, None
+    model, old, new = delayed(job.model.process_model(), 0.5 * Ts), _gains(job.old_gains), _gains(job.new_gains)
+    ends = horizons(model, (new, old), Ts)
+    found = [None if gains is None else loop_curves(model, gains, ends, Ts) for gains in (old, new)]
+    return found[0], found[1]
 
 
 def _performance(source: ReportSource, after: bool) -> PerformanceView | None:
@@ -277,8 +291,7 @@ def _table(
     row("Overshoot of a set-point step", "%", *figure("overshoot_pct"), 0)
 
     def figure_step(name: str, which: str) -> tuple[float | None, float | None]:
-        values = [None if each is None else getattr(each, which) for each in (before, after)]
-        found = [getattr(each, name) if isinstance(each, StepPerformanceView) else None for each in values]
+        found = [_of_step(each, name, which) for each in (before, after)]
         return found[0], found[1]
 
     compared = job.comparison
@@ -288,7 +301,7 @@ def _table(
         asked = _at_most(compared.mv_peak_asked)
         row("Change of MV after it, at most", f"% per {pv_unit}{asked}", *figure_step("mv_peak", "setpoint"))
     row("IAE of a unit set-point step", "s", *figure_step("IAE", "setpoint"))
-    row("IAE of a load step of 1 %", f"{pv_unit} s", *figure_step("IAE", "load"))
+    row(f"IAE of a load step of {LOAD_PCT:g} %", f"{pv_unit} s", *figure_step("IAE", "load"))
     row("Largest deviation after it", pv_unit, *figure_step("peak", "load"))
     if job.before is not None or job.after is not None:
         measured = (job.before, job.after)
@@ -301,6 +314,15 @@ def _table(
         row("Settling, measured", "s", *both("settling_s"))
         row("IAE, measured", f"{pv_unit} s", *both("IAE"))
     return rows
+
+
+def _of_step(performance: PerformanceView | None, name: str, which: str) -> float | None:
+    """A figure of the unit step of the set-point, or of a load step as large as the one that is drawn."""
+    step = None if performance is None else getattr(performance, which)
+    if not isinstance(step, StepPerformanceView):
+        return None
+    value: float | None = getattr(step, name)
+    return value if value is None or which == "setpoint" else LOAD_PCT * value
 
 
 def _at_most(asked: float | None) -> str:
@@ -339,7 +361,7 @@ def _model_rows(source: ReportSource, pv_unit: str) -> list[Row]:
     model = job.model
     if isinstance(model, TransferModelView):
         rows += [
-            ("structure", model.structure, False),
+            ("structure", model.named, False),
             ("dead time", n.with_unit(n.with_error(model.dead_time_s, model.dead_time_error_s), "s"), False),
             ("numerator", f"{n.list_with_errors(model.num, model.num_errors)} ({pv_unit}/%)", True),
             ("denominator", n.list_with_errors(model.den, model.den_errors), True),
@@ -405,7 +427,7 @@ def _designs(curve: DesignCurve | None) -> list[list[str]]:
                 n.fixed(performance.PM_deg, 0),
                 n.fixed(performance.overshoot_pct, 0),
                 n.significant(performance.setpoint.IAE if performance.setpoint else None, 3),
-                n.significant(performance.load.IAE if performance.load else None, 3),
+                n.significant(_of_step(performance, "IAE", "load"), 3),
             ]
         )
     return rows

@@ -9,22 +9,15 @@ import numpy as np
 
 from loopwright.service.api.report.drawing import Label, Picture, around
 from loopwright.service.api.report.words import stage_name
+from loopwright.service.curves import LOAD_PCT, LoopCurves
 from loopwright.service.jobs.job_record import JobRecord
 from loopwright.service.listening.bins import GAP_BEFORE, Bins
-from loopwright.tuning.analysis.margins import margins
-from loopwright.tuning.analysis.stability import open_loop
-from loopwright.tuning.analysis.step_response import step_response
-from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import Model, Reals, time_constants
-from loopwright.tuning.reasons import Ended
+from loopwright.tuning.models import Reals
 
 WIDTH = 690.0
 _SMALL = (225.0, 160.0)
 _POINTS = 450
-_SHOWN_SETTLINGS = 1.6
 _LABEL_APART = 120.0
-LOAD_PCT = 10.0
-"""Size of the load step that is drawn, percent of MV."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,47 +102,39 @@ def _extremes(bins: Bins, name: str) -> tuple[Reals, Reals]:
 
 
 def step_pictures(
-    model: Model, before: Gains | None, after: Gains | None, size: float, Ms: float | None
-) -> StepPictures:
-    """Returns the answers of the loop on the model, under the gains before and after.
+    before: LoopCurves | None, after: LoopCurves | None, size: float, Ms: float | None, unstable: bool = False
+) -> StepPictures | None:
+    """Returns the pictures of these curves of the loop, before and after; None where there are none.
 
-    model: with the delay of the sampling in its dead time.
     size: of the set-point step, PV units.
     Ms: of the gains after, or of those before where there are none: the radius of the circle.
+    unstable: whether the gains before are known and not stable on the model.
     """
-    loops = [(gains, look) for gains, look in ((before, "old"), (after, "new")) if gains is not None]
-    stable = [(gains, look) for gains, look in loops if _is_stable(model, gains)]
-    horizon = max((_settling(model, gains) for gains, _ in stable[-1:]), default=20.0 * (model.L + 1.0))
-    answers = {}
-    for load, factor in ((False, size), (True, LOAD_PCT)):
-        found = []
-        for gains, look in stable:
-            try:
-                response = step_response(model, gains, horizon, load=load)
-            except Ended:
-                continue
-            at = np.linspace(0.0, horizon, 240)
-            found.append((at, factor * np.interp(at, response.t, response.y), look))
-        answers[load] = found
-    target = np.asarray([0.0, size])
-    setpoint = Picture(
-        "step", "PV after a set-point step", (0.0, horizon), around([target, *(y for _, y, _ in answers[False])], 0.0),
-        *_SMALL, x_apart=44.0,
-    )  # fmt: skip
-    setpoint.curve([0.0, horizon], [size, size], "sp")
-    load_picture = Picture(
-        "loadstep", "PV after a load step", (0.0, horizon),
-        around([np.zeros(1), *(y for _, y, _ in answers[True])], 1e-6), *_SMALL, x_apart=44.0,
-    )  # fmt: skip
-    for picture, load in ((setpoint, False), (load_picture, True)):
-        for at, y, look in answers[load]:
-            picture.curve(at, y, look)
-        if before is not None and not any(look == "old" for _, look in stable):
+    shown = [(curves, look) for curves, look in ((before, "old"), (after, "new")) if curves is not None]
+    if not shown:
+        return None
+    pictures = []
+    for name, which, factor, target in (
+        ("PV after a set-point step", "setpoint", size, [0.0, size]),
+        ("PV after a load step", "load", LOAD_PCT, [0.0, 1e-6]),
+    ):
+        curves = [(getattr(each, which), look) for each, look in shown]
+        end = curves[-1][0].horizon_s
+        values = [factor * np.asarray(curve.pv) for curve, _ in curves]
+        picture = Picture(
+            which, name, (0.0, end), around([np.asarray(target), *values], 0.0), *_SMALL, x_apart=44.0
+        )  # fmt: skip
+        if which == "setpoint":
+            picture.curve([0.0, end], [size, size], "sp")
+        for (curve, look), y in zip(curves, values, strict=True):
+            picture.curve(curve.t, y, look)
+        if unstable:
             picture.labels.append(Label(60.0, 20.0, "before: not stable on the model"))
-    return StepPictures(setpoint, load_picture, _nyquist(model, loops, Ms))
+        pictures.append(picture)
+    return StepPictures(pictures[0], pictures[1], _nyquist(shown, Ms))
 
 
-def _nyquist(model: Model, loops: list[tuple[Gains, str]], Ms: float | None) -> Picture:
+def _nyquist(shown: list[tuple[LoopCurves, str]], Ms: float | None) -> Picture:
     width, height = _SMALL
     y = (-1.55, 1.0)
     # the same scale on both axes
@@ -161,36 +146,9 @@ def _nyquist(model: Model, loops: list[tuple[Gains, str]], Ms: float | None) -> 
     angle = np.linspace(0.0, 2.0 * np.pi, 121)
     if Ms is not None and Ms > 1.0:
         picture.curve(-1.0 + np.cos(angle) / Ms, np.sin(angle) / Ms, "circle")
-    scale = model.L + float(np.sum(time_constants(model)))
-    w = np.geomspace(1e-3, 1e3, 1500) / (scale or 1.0)
-    for gains, look in loops:
-        try:
-            N, D = open_loop(model, gains)
-        except Ended:
-            continue
-        s = 1j * w
-        loop = np.polyval(N, s) / np.polyval(D, s) * np.exp(-model.L * s)
-        shown = (np.abs(loop) < 4.0) & (np.abs(loop) > 0.08)
-        picture.curve(np.where(shown, loop.real, np.nan), np.where(shown, loop.imag, np.nan), look)
+    for curves, look in shown:
+        picture.curve(np.asarray(curves.nyquist_re), np.asarray(curves.nyquist_im), look)
     minus_one = (picture.at_x(-1.0), picture.at_y(0.0))
     picture.labels.append(Label(minus_one[0] - 7.0, minus_one[1] + 4.0, "+", "point"))
     picture.labels.append(Label(minus_one[0] - 14.0, minus_one[1] - 6.0, "−1"))
     return picture
-
-
-def _is_stable(model: Model, gains: Gains) -> bool:
-    try:
-        return margins(model, gains).stable
-    except Ended:
-        return False
-
-
-def _settling(model: Model, gains: Gains) -> float:
-    """Returns a time within which the answers to both steps have come to rest, s."""
-    times = []
-    for load in (False, True):
-        found = step_response(model, gains, load=load)
-        away = np.abs(found.y - found.y[-1])
-        late = np.flatnonzero(away > 0.05 * float(np.max(away, initial=0.0)))
-        times.append(float(found.t[late[-1]]) if len(late) else float(found.t[-1]))
-    return max(_SHOWN_SETTLINGS * max(times), 4.0 * model.L, 1e-6)

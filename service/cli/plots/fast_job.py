@@ -15,22 +15,22 @@ from matplotlib.figure import Figure, SubFigure
 
 from loopwright.service.cli.plots import style
 from loopwright.service.cli.plots.shown import Shown
+from loopwright.service.curves import LOAD_PCT
 from loopwright.service.jobs.stored_record import StoredRecord
 from loopwright.service.results import EvidenceView
 from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.analysis.step_figures import StepFigures
 from loopwright.tuning.analysis.step_response import Response, step_response
+from loopwright.tuning.fast.proposal import delayed
 from loopwright.tuning.fast.structure_choice import choose_structure
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import Fit, averaged
-from loopwright.tuning.models import Model, Reals
+from loopwright.tuning.models import Model, Reals, sign
 from loopwright.tuning.reasons import Ended
 
 SHOWN_SETTLINGS, MAX_SHOWN_SETTLINGS = 2.5, 6.0
 """Lengths of the time axis of a step, in settling times of the loop that settles sooner: one at which its transient
 still fills the picture, and the longest, where the other loop settles later."""
-LOAD_PCT = 10.0
-"""Size of the load step that is drawn, percent of MV."""
 
 
 def fast_job(path: Path, job: Shown, record: StoredRecord, pv_unit: str) -> None:
@@ -66,7 +66,9 @@ def before_after(figure: Figure | SubFigure, job: Shown, pv_unit: str) -> None:
     figure: a figure or a part of one.
     """
     assert job.model is not None and job.old_gains is not None and job.new_gains is not None
-    model = job.model.process_model()
+    # with half a sample of delay, as the figures of the job
+    model = delayed(job.model.process_model(), 0.5 * (job.sample_time_s or 0.0))
+    turned = sign(model)  # the responses are of a plant of positive gain
     # method setpoint steps home, which is mostly down
     size = 1.0 if job.verification is None else abs(job.verification.step or 1.0)
     gains = {
@@ -80,12 +82,13 @@ def before_after(figure: Figure | SubFigure, job: Shown, pv_unit: str) -> None:
         pv, mv = axes[0, column], axes[1, column]
         horizon = _horizon(model, assessed, load)
         curves = _answers(model, gains, assessed, horizon, load)
-        scale = LOAD_PCT if load else size
+        scale = turned * LOAD_PCT if load else size
         pv.set_xlim(0.0, horizon)
         for label, response in curves.items():
             colour, line = style.LOOKS[label]
             pv.plot(response.t, scale * response.y, color=colour, linestyle=line, linewidth=1.6)
-            mv.plot(response.t, scale * response.u, color=colour, linestyle=line, linewidth=1.3)
+            moved = turned * (LOAD_PCT if load else size) * response.u
+            mv.plot(response.t, moved, color=colour, linestyle=line, linewidth=1.3)
         pv.axhline(0.0 if load else size, color=style.SETPOINT, linestyle=":", linewidth=0.9)
         for each in () if load else (pv, mv):
             low, high = each.get_ylim()

@@ -27,6 +27,7 @@ class Shown(Protocol):
     new_gains: GainsView | None
     evidence: EvidenceView | None
     verification: VerificationView | None
+    sample_time_s: float | None
 
 
 def _nan_for_null(value: object) -> object:

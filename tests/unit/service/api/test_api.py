@@ -219,7 +219,7 @@ def test_a_t95_that_is_wrong_is_noted(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The plant of these tests has about the T95 of its configuration, 9 s."""
-    monkeypatch.setattr(worker, "t95_mismatch", lambda model, t95_s: t95_mismatch(model, 10.0 * t95_s))
+    monkeypatch.setattr(worker, "t95_mismatch", lambda model, t95_s, record_s: t95_mismatch(model, 10.0 * t95_s))
     job = finished(service, client)
     noted = [data["text"] for _, kind, data in events(client.get(f"{job['url']}/events").text) if kind == "note"]
     assert job["state"] == "proposed" and any("about 9 times too long" in text for text in noted), noted

@@ -199,7 +199,10 @@ def test_gains_of_fast_for_another_Ms(service: Service, client: TestClient, Ms: 
     # the fake loop samples every 0.1 s
     assert margins(FOPDT(2.0, 3.0, 1.05), gains).Ms == pytest.approx(Ms, abs=0.01)
     assert fast["margins"]["Ms"] == pytest.approx(Ms, abs=0.01) and fast["setpoint"]["IAE"] > 0
-    assert (gains.Td > 0) == derivative and fast["gains"]["b"] != 1.0
+    assert (gains.Td > 0) == derivative and fast["gains"]["b"] <= 1.0
+    more = client.get(f"{job['url']}/alternatives?{query}&setpoint_weight_max=2").json()["methods"][0]
+    assert more["gains"]["b"] >= fast["gains"]["b"] and (Ms > 1.4 or more["gains"]["b"] > 1.0)
+    assert more["retune"]["setpoint_weight_max"] == 2.0 and "setpoint_weight_max" not in fast["retune"]
     asked = retune_request(**fast["retune"])
     assert (asked.method, asked.start, asked.ms, asked.derivative) == ("fast", "design", Ms, derivative)
     assert asked.model is not None

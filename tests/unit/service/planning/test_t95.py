@@ -6,6 +6,7 @@ import pytest
 
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.planning.t95 import t95_mismatch, t95_of
+from loopwright.service.results import TransferModelView
 from loopwright.tuning.models import FOPDT, Integrating, Model, TransferFunction
 
 
@@ -32,3 +33,32 @@ def test_what_is_wrong_by_ten_is_said() -> None:
 
 def test_a_plant_that_integrates_has_none() -> None:
     assert t95_of(Integrating(0.1, 3.0)) is None and t95_mismatch(Integrating(0.1, 3.0), 1e6) is None
+
+
+def test_the_lag_of_a_level_is_not_held_against_the_configuration() -> None:
+    """Its fit has a pole near zero: by three times that lag t95_s would be 705 times too short."""
+    level = TransferFunction((0.0037,), (1.0, 7.09e-5), 4.0)
+    assert t95_mismatch(level, 60.0) is not None
+    assert t95_mismatch(level, 60.0, record_s=400.0) is None
+    heater = FOPDT(3.0, 2400.0, 90.0)
+    assert t95_mismatch(heater, 600.0, record_s=1800.0) is not None
+
+
+@pytest.mark.parametrize(
+    ("den", "errors", "integrating"),
+    [
+        ([1.0, 7.09e-5], [0.0, 8.4e-5], True),
+        ([1.0, -2e-5], [0.0, 4e-5], True),
+        ([1.0, 0.2, 3e-4], [0.0, 0.01, 2e-4], True),
+        ([1.0, 0.2, 0.0], None, True),
+        ([1.0, 0.1], [0.0, 0.01], False),
+        ([1.0, 7.09e-5], None, False),
+        ([1.0], None, False),
+    ],
+)
+def test_a_model_is_called_integrating_where_its_pole_cannot_be_told_from_zero(
+    den: list[float], errors: list[float] | None, integrating: bool
+) -> None:
+    model = TransferModelView(structure="fopdt", num=[1.0], den=den, dead_time_s=1.0, den_errors=errors)
+    assert model.model_dump()["integrating"] is integrating and ("integrating" in model.named) is integrating
+    assert TransferModelView.model_validate(model.model_dump()) == model, "as stored"

@@ -15,7 +15,7 @@ from loopwright.tuning.analysis.comparison import Comparison, LoopPerformance, l
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.analysis.step_response import step_response
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.design import MAX_COST_RATIO, Aim, DesignSpec, GainDesign, OptimalGains
+from loopwright.tuning.fast.design import MAX_COST_RATIO, MAX_WEIGHT, Aim, DesignSpec, GainDesign, OptimalGains
 from loopwright.tuning.fast.evaluation import evaluate
 from loopwright.tuning.fast.iae import LoopCost
 from loopwright.tuning.fast.proposal import comparison_on
@@ -82,7 +82,7 @@ def test_the_settling_time_of_a_cancelled_pole_is_ln_20_time_constants(T: float)
 @pytest.mark.parametrize("derivative", [False, True])
 @pytest.mark.parametrize("b", [0.0, 0.7, 1.6])
 def test_the_movement_of_MV_is_that_of_the_exact_response(name: str, derivative: bool, b: float) -> None:
-    best = design_of(name, DesignSpec(1.6, derivative)).best().gains
+    best = design_of(name, DesignSpec(1.6, derivative, weights=(0.0, 2.0))).best().gains
     gains = replace(best, b=b)
     responses = LoopCost(MODELS[name], period(MODELS[name])).responses(gains.Kp, gains.Ti, gains.Td, 10.0)
     u, by = movement(responses)
@@ -303,3 +303,17 @@ def test_bad_input_is_named(name: str, value: float) -> None:
     with pytest.raises(Refused) as refused:
         DesignSpec(**{name: value})  # type: ignore[arg-type]
     assert refused.value.reason is Reason.BAD_INPUT and name in refused.value.detail
+
+
+def test_the_set_point_weight_that_a_refusal_names_is_the_least_that_would_do() -> None:
+    settled = free("five lags", DesignSpec()).setpoint
+    assert settled is not None and settled.settling_s is not None
+    spec = DesignSpec(settling_s=0.85 * settled.settling_s)
+    named = re.search(r"for a set-point weight b of ([\d.]+), where the controller takes", refusal("five lags", spec))
+    assert named is not None
+    b = float(named[1])
+    assert b <= MAX_WEIGHT
+    best = required(design_of("five lags", replace(spec, weights=(0.0, b))))
+    assert 1.0 < best.gains.b <= b
+    assert figures("five lags", best)[1] <= NEARLY * (spec.settling_s or 0.0)
+    assert refusal("five lags", replace(spec, weights=(0.0, b - 0.05)))

@@ -1,15 +1,22 @@
 // @ts-check
-/** The gains from robust to fast that the service has designed on a job's model, asked for once and kept. */
+/** What a job's gains do on its model, and the gains from robust to fast: the service's, asked for once and kept. */
 import { signal } from "../vendor/signals-core.js";
 import { ask } from "./api.js";
 
-/** @type {Map<string, {found: import("../vendor/signals-core.js").Signal<{ms: number, gains: any, uncertainty: number | null}[]>, state: import("../vendor/signals-core.js").Signal<"" | "asked" | "done">}>} */
+/**
+ * @typedef {{horizon_s: number, pv: number[]}} StepCurve PV after a unit step, at times evenly spaced
+ * @typedef {{setpoint: StepCurve, load: StepCurve, nyquist_re: number[], nyquist_im: number[]}} Curves
+ * @typedef {{ms: number, gains: any, uncertainty: number | null, performance: any, beside: string | null, curves: Curves | null}} Design
+ * @typedef {{designs: Design[], before: any, after: any, before_curves: Curves | null, after_curves: Curves | null, after_beside: string | null}} Found
+ */
+
+/** @type {Map<string, {found: import("../vendor/signals-core.js").Signal<Found | null>, state: import("../vendor/signals-core.js").Signal<"" | "asked" | "done">}>} */
 const kept = new Map();
 
 /** @param {string} job its URL */
 export function designsOf(job) {
   let it = kept.get(job);
-  if (!it) kept.set(job, (it = { found: signal(/** @type {any[]} */ ([])), state: signal(/** @type {"" | "asked" | "done"} */ ("")) }));
+  if (!it) kept.set(job, (it = { found: signal(/** @type {Found | null} */ (null)), state: signal(/** @type {"" | "asked" | "done"} */ ("")) }));
   return it;
 }
 
@@ -20,9 +27,10 @@ export async function fillDesigns(job, stop) {
   it.state.value = "asked";
   try {
     const answer = await ask(`${job}/designs`, stop);
-    it.found.value = answer.designs
-      .filter((/** @type {any} */ each) => each.gains)
-      .map((/** @type {any} */ each) => ({ ms: each.Ms_asked, gains: each.gains, uncertainty: each.uncertainty }));
+    const designs = answer.designs
+      .filter((/** @type {any} */ each) => each.gains && each.performance)
+      .map((/** @type {any} */ each) => ({ ...each, ms: each.Ms_asked }));
+    it.found.value = { ...answer, designs };
     it.state.value = "done";
   } catch (error) {
     if (stop.aborted) return;

@@ -45,7 +45,7 @@ export function yRange(columns, minimum) {
 
 /**
  * @typedef {{label: string, colour: string, dash?: number[], width?: number, stepped?: boolean}} Line
- * @typedef {{lines: Line[], height: number, withTime: boolean, zero?: () => number | null, beneath?: (u: any, ctx: CanvasRenderingContext2D) => void,
+ * @typedef {{lines: Line[], height: number, withTime: boolean, zero?: () => number | null, pace?: () => number, beneath?: (u: any, ctx: CanvasRenderingContext2D) => void,
  *   above?: (u: any, ctx: CanvasRenderingContext2D) => void, onCursor?: (u: any) => void, onSelect?: (from: number, to: number) => void, sync?: string}} PlotOptions
  */
 
@@ -92,14 +92,16 @@ export function makePlot(where, options) {
           size: options.withTime ? 24 : 0,
           splits: (u, _n, low, high) => {
             const zero = options.zero?.() ?? 0;
-            const distance = tickDistance(high - low, Math.max(2, Math.floor(u.bbox.width / devicePixelRatio / 110)));
-            return ticks(low - zero, high - zero, distance).map((value) => value + zero);
+            const pace = options.pace?.() ?? 1; // seconds that are shown for one of the data
+            const distance = tickDistance(pace * (high - low), Math.max(2, Math.floor(u.bbox.width / devicePixelRatio / 110)));
+            return ticks(pace * (low - zero), pace * (high - zero), distance).map((value) => value / pace + zero);
           },
           values: (_u, splits) => {
             if (!options.withTime) return splits.map(() => "");
             const zero = options.zero?.() ?? null;
-            const distance = splits.length > 1 ? splits[1] - splits[0] : 1;
-            return splits.map((value) => (zero === null ? timeOfDay(value) : `${tick(value - zero, distance)} s`));
+            const pace = options.pace?.() ?? 1;
+            const distance = splits.length > 1 ? pace * (splits[1] - splits[0]) : 1;
+            return splits.map((value) => (zero === null ? timeOfDay(value) : `${tick(pace * (value - zero), distance)} s`));
           },
         },
         {

@@ -63,6 +63,22 @@ export function weight(gains) {
   return known(gains?.b) && gains.b !== 1 ? `, b ${significant(gains.b, 3)}` : "";
 }
 
+/**
+ * The name of a mark in a picture of a record. A step that follows a relay or pulses does not begin at rest.
+ * @param {{stage: string}[]} marks @param {number} n
+ */
+export function markName(marks, n) {
+  const name = stageName(marks[n].stage);
+  const before = marks[n].stage === "verify" && n > 0 ? { relay: "the relay", pulses: "the pulses" }[marks[n - 1].stage === "design" ? (marks[n - 2]?.stage ?? "") : marks[n - 1].stage] : undefined;
+  return before ? `${name}, from where ${before} left PV` : name;
+}
+
+/** The set-point weight that was on the loop, where that of the gains proposed is larger and was not. @param {any} job @returns {number | null} */
+export function untriedWeight(job) {
+  const tried = job.verification?.b ?? 1;
+  return job.verification && known(job.new_gains?.b) && job.new_gains.b > Math.max(1, tried) ? tried : null;
+}
+
 /** @type {Record<string, string>} */
 const REASONS = {
   operator: "by an operator",

@@ -28,6 +28,7 @@ def drawn_axes(old: Gains, new: Gains, step: float | None = 0.1) -> list[Axes]:
         old_gains=GainsView.of(old),
         new_gains=GainsView.of(new),
         verification=None if step is None else SimpleNamespace(step=step),
+        sample_time_s=None,
     )
     figure = Figure()
     before_after(figure, cast(Shown, job), "degC")

@@ -1,13 +1,12 @@
 // @ts-check
 /** Before and after: what can be had between robust and fast, steps, Nyquist, the table, and the decision. */
-import { useEffect, useMemo, useRef, useState } from "../../vendor/hooks.js";
+import { useEffect, useRef, useState } from "../../vendor/hooks.js";
 import { ask, command } from "../api.js";
-import { between, frequency, modelOf, slowness, step } from "../control.js";
 import { designsOf, fillDesigns } from "../designs.js";
 import { html } from "../html.js";
 import { change, fixed, known, ms as msText, msError, pvDecimals, significant, unit, withUnit } from "../numbers.js";
 import { isSilent, may, refreshLoops, rowOf, sign, signature } from "../state.js";
-import { decisionRequestWords, weight } from "../words.js";
+import { decisionRequestWords, untriedWeight, weight } from "../words.js";
 import { Curve, NyquistPlot, StepPlot } from "./figures.js";
 
 const LOAD_PCT = 10;
@@ -16,14 +15,12 @@ const GAP = 16;
 
 /** @param {{loop: any, detail: any, job: any, latest: boolean, quiet: boolean, onChanged: (job: any) => void}} props */
 export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
-  // The gains of these methods are designed for the sampled loop, which is half a sample later than the model.
-  const sampling_s = job.method === "fast" || job.method === "setpoint" ? (job.sample_time_s ?? 0) / 2 : 0;
-  const model = useMemo(() => modelOf(job.model, sampling_s) ?? (job.rehearsed_on ? modelOf({ ...job.rehearsed_on }) : null), [job.id]);
-  const designed = (job.method === "fast" || job.method === "setpoint") && !job.dry_run && !!model;
+  const designed = (job.method === "fast" || job.method === "setpoint") && !job.dry_run;
   const tested = job.chosen.Ms ?? job.predicted?.Ms ?? Number(job.request.ms ?? 1.6);
   const [ms, setMs] = useState(/** @type {number} */ (tested));
-  const grid = designsOf(job.url).found.value;
-  const asked = designsOf(job.url).state.value === "asked";
+  const { found: foundSignal, state } = designsOf(job.url);
+  const found = foundSignal.value;
+  const asked = state.value === "asked";
   const curve = useRef(/** @type {HTMLElement | null} */ (null));
   const [width, setWidth] = useState(760);
   useEffect(() => {
@@ -33,50 +30,64 @@ export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
     return () => watch.disconnect();
   }, [job.id]);
   useEffect(() => {
-    if (!designed) return;
     const stop = new AbortController();
     void fillDesigns(job.url, stop.signal);
     return () => stop.abort();
   }, [job.id]);
-  const own = { ms: tested, gains: job.new_gains, uncertainty: job.evidence?.uncertainty ?? null };
-  const designs = [...grid.filter((each) => Math.abs(each.ms - tested) > 0.02), own].sort((a, b) => a.ms - b.ms);
-  const atTested = Math.abs(ms - tested) < 0.0101;
-  const gains = atTested ? job.new_gains : (between(designs, ms) ?? job.new_gains);
-  const size = job.verification?.step ?? job.after?.step ?? loop.sp_deviation;
-  const horizon_s = useMemo(() => {
-    if (!model) return 10;
-    const settle = Math.max(job.comparison?.after.setpoint?.settling_s ?? 0, job.comparison?.after.load?.settling_s ?? 0);
-    return Math.max(settle * 1.3, 6 * slowness(model, job.new_gains));
-  }, [job.id]);
-  const before = useMemo(() => (model && job.old_gains ? pictures(model, job.old_gains, size, horizon_s) : null), [job.id]);
-  const after = useMemo(() => (model ? pictures(model, gains, size, horizon_s) : null), [job.id, gains.Kp, gains.Ti, gains.Td, gains.b]);
-  const points = useMemo(() => (model ? designs.map((each) => ({ ms: each.ms, IAE: step(model, each.gains, { load: 1 }, horizon_s, 300).IAE })) : []), [job.id, grid.length]);
-  const found = nameOf(job);
+  const old = job.comparison?.before ?? found?.before ?? null;
+  /** @type {import("../designs.js").Design} */
+  const own = {
+    ms: tested, gains: job.new_gains, uncertainty: job.evidence?.uncertainty ?? null,
+    performance: job.comparison?.after ?? found?.after ?? null, curves: found?.after_curves ?? null,
+    beside: found?.after_beside ?? null,
+  };
+  const designs = [...(designed ? (found?.designs ?? []).filter((each) => Math.abs(each.ms - tested) > 0.02) : []), own].sort((a, b) => a.ms - b.ms);
+  const chosen = designs.find((each) => Math.abs(each.ms - ms) < 1e-9) ?? own;
+  const atTested = chosen === own;
+  const size = Math.abs(job.verification?.step || job.after?.step || loop.sp_deviation);
+  const points = designs.filter((each) => each.performance?.load?.IAE > 0).map((each) => ({ ms: each.ms, IAE: each.performance.load.IAE }));
+  const name = nameOf(job);
   const narrow = matchMedia("(max-width: 720px)").matches;
   const small = narrow ? width : (width - 2 * GAP) / 2.8;
-  const stableBefore = job.comparison?.before.stable ?? true;
+  const [before, after] = [found?.before_curves ?? null, chosen.curves];
+  const Ms = chosen.performance?.Ms ?? chosen.ms;
+  const decided = job.state === "accepted" || job.state === "rolled_back"; // its verdict speaks of the gains before as the present ones
+  const verdict = atTested && !decided ? job.comparison?.verdict : chosen.beside;
 
   return html`<div class="card choice"><div class="body"><div ref=${curve}>
-      ${designed && html`<div class="curve" key="curve"><div class="split"><span class="title">Faster or more robust</span><span>Ms <b>${msText(ms)}</b> <span class="quiet">${!atTested ? "not tested" : job.verification || job.after ? "as asked and tested" : "as asked"}</span></span></div>
-        ${Curve(width, points, ms, tested, job.comparison?.before.Ms ?? null, model && job.old_gains && stableBefore ? step(model, job.old_gains, { load: 1 }, horizon_s, 300).IAE : null)}
-        <input type="range" min=${designs[0].ms} max=${designs[designs.length - 1].ms} step="0.01" value=${ms} disabled=${designs.length < 2} aria-label="Ms" aria-valuetext=${`Ms ${msText(ms)}${!atTested ? "" : job.tried === false ? ", as asked" : ", as tested"}`}
-          onInput=${(/** @type {any} */ e) => { const value = Number(e.target.value); setMs(Math.abs(value - tested) < 0.015 ? tested : value); }}
+      ${designed && html`<div class="curve" key="curve"><div class="split"><span class="title">Faster or more robust</span><span>Ms <b>${msText(ms)}</b> <span class="quiet">${atTested ? testedWords(job) : "not tested"}</span></span></div>
+        ${Curve(width, points, ms, tested, old?.Ms ?? null, old?.stable ? (old.load?.IAE ?? null) : null)}
+        <input type="range" min=${designs[0].ms} max=${designs[designs.length - 1].ms} step="0.01" value=${ms} disabled=${designs.length < 2} aria-label="Ms" aria-valuetext=${`Ms ${msText(ms)}, ${atTested ? testedWords(job) : "not tested"}`}
+          onInput=${(/** @type {any} */ e) => setMs(nearest(designs, Number(e.target.value)))}
           onDblClick=${() => setMs(tested)} onKeyDown=${(/** @type {any} */ e) => slide(e, tested, designs, setMs)} />
         <div class="ends"><span>${msText(designs[0].ms)} robust</span>${asked && html`<span class="quiet">asking for the designs…</span>`}<span>fast ${msText(designs[designs.length - 1].ms)}</span></div></div>`}
       ${after && html`<div class="small-plots" key="plots">
-        <figure><figcaption><b>Set-point step</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(small, stableBefore ? before?.setpoint : null, after.setpoint, size, "Set-point step before and after")}</figure>
-        <figure><figcaption><b>Load step of ${LOAD_PCT} %</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(small, stableBefore ? before?.load : null, after.load, 0, "Load step before and after")}</figure>
-        <figure><figcaption><b>Distance from −1</b> Nyquist</figcaption>${NyquistPlot(narrow ? small : 0.8 * small, before?.freq ?? null, after.freq, atTested ? (job.comparison?.after.Ms ?? after.freq.Ms) : after.freq.Ms)}</figure></div>
-        <div class="legend" key="legend" style=${{ marginTop: "8px" }}><span class="old">before</span><span class="new">${atTested ? found : "chosen"}</span></div>`}
-    </div><div>${Table(loop, job, gains, before, after, atTested, size)}${!job.reason && html`<p class="note" key="verdict">${job.comparison?.verdict}</p>`}</div></div>
+        <figure><figcaption><b>Set-point step</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(small, before?.setpoint ?? null, after.setpoint, size, true, "Set-point step before and after")}</figure>
+        <figure><figcaption><b>Load step of ${LOAD_PCT} %</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(small, before?.load ?? null, after.load, LOAD_PCT, false, "Load step before and after")}</figure>
+        <figure><figcaption><b>Distance from −1</b> Nyquist</figcaption>${NyquistPlot(narrow ? small : 0.8 * small, before, after, Ms)}</figure></div>
+        <div class="legend" key="legend" style=${{ marginTop: "8px" }}><span class="old">before</span><span class="new">${atTested ? name : "chosen"}</span><span class="quiet">computed on the model</span></div>`}
+      ${!after && html`<p class="quiet" key="no-plots">${asked ? "asking for the curves…" : state.value === "done" ? "The service has no curves for these gains." : ""}</p>`}
+    </div><div>${Table(loop, job, chosen, old, atTested, size, found)}${!job.reason && verdict && html`<p class="note" key="verdict">${verdict}</p>`}</div></div>
     ${!quiet && html`<${Decide} key="decide" loop=${loop} detail=${detail} job=${job} latest=${latest} ms=${ms} tested=${tested} atTested=${atTested} back=${() => setMs(tested)} onChanged=${onChanged} />`}
   </div>`;
+}
+
+/** What of the gains found was on the loop. @param {any} job */
+function testedWords(job) {
+  if (!job.verification && !job.after) return "as asked";
+  const b = untriedWeight(job);
+  return b === null ? "as asked and tested" : `as asked; tested with b ${significant(b, 3)}`;
+}
+
+/** The Ms of the design that is nearest. @param {import("../designs.js").Design[]} designs @param {number} ms */
+function nearest(designs, ms) {
+  return designs.reduce((best, each) => (Math.abs(each.ms - ms) < Math.abs(best - ms) ? each.ms : best), designs[0].ms);
 }
 
 /** What the gains are that were found. @param {any} job */
 const nameOf = (job) => (["proposed", "accepted", "rolled_back"].includes(job.state) ? "proposed" : "found");
 
-/** @param {any} e @param {number} tested @param {any[]} designs @param {any} setMs */
+/** From one design to the next. @param {any} e @param {number} tested @param {import("../designs.js").Design[]} designs @param {any} setMs */
 function slide(e, tested, designs, setMs) {
   const move = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[/** @type {string} */ (e.key)];
   if (e.key === "Escape") {
@@ -84,33 +95,27 @@ function slide(e, tested, designs, setMs) {
     setMs(tested);
   } else if (move) {
     e.preventDefault();
-    const by = e.shiftKey ? 0.05 : 0.01;
     setMs((/** @type {number} */ ms) => { // a key that repeats comes more often than the page is drawn
-      const to = Math.round((ms + move * by) * 100) / 100;
-      return Math.abs(to - tested) < 0.005 ? tested : Math.min(designs[designs.length - 1].ms, Math.max(designs[0].ms, to));
+      const at = designs.findIndex((each) => Math.abs(each.ms - ms) < 1e-9);
+      return designs[Math.min(designs.length - 1, Math.max(0, at + move))].ms;
     });
   }
-}
-
-/** @param {any} model @param {any} gains @param {number} size @param {number} horizon_s */
-function pictures(model, gains, size, horizon_s) {
-  return { setpoint: step(model, gains, { setpoint: size }, horizon_s), load: step(model, gains, { load: LOAD_PCT }, horizon_s), freq: frequency(model, gains) };
 }
 
 /** What was asked for, beside the name of a figure. @param {number | null | undefined} value */
 const atMost = (value) => (known(value) ? `, asked: at most ${significant(Number(value), 3)}` : "");
 
-/** @param {any} loop @param {any} job @param {any} gains @param {any} before @param {any} after @param {boolean} atTested @param {number} size */
-function Table(loop, job, gains, before, after, atTested, size) {
+/** @param {any} loop @param {any} job @param {import("../designs.js").Design} chosen @param {any} was performance before @param {boolean} atTested @param {number} size @param {import("../designs.js").Found | null} found */
+function Table(loop, job, chosen, was, atTested, size, found) {
   const u = unit(loop.pv_unit);
   const old = job.old_gains;
-  const was = job.comparison?.before;
-  const will = atTested ? job.comparison?.after : null;
-  const drawn = (/** @type {any} */ p) => p && { Ms: p.freq.Ms, GM: p.freq.GM, PM_deg: p.freq.PM_deg, overshoot_pct: p.setpoint.overshoot_pct, setpoint: { settling_s: p.setpoint.settling_s }, load: { IAE: p.load.IAE / LOAD_PCT } };
-  const a = was ?? drawn(before) ?? {};
-  const b = will ?? drawn(after) ?? {};
+  const gains = chosen.gains;
+  const a = was ?? {};
+  const b = chosen.performance ?? {};
   const stable = was?.stable ?? true;
-  const uncertain = atTested ? job.evidence?.uncertainty : null;
+  const uncertain = chosen.uncertainty;
+  const load = (/** @type {any} */ of) => (known(of.load?.IAE) ? LOAD_PCT * of.load.IAE : null);
+  const [dm, dmAfter] = [a.delay_margin_s ?? found?.before?.delay_margin_s, b.delay_margin_s ?? (atTested ? found?.after?.delay_margin_s : null)];
   /** @type {[any, string, number | null | undefined, number | null | undefined, (v: any) => string][]} */
   const rows = [
     [html`Gain Kp <small>%/${u}</small>`, "kp", old?.Kp, gains.Kp, significant],
@@ -118,12 +123,12 @@ function Table(loop, job, gains, before, after, atTested, size) {
     ...(old?.Td || gains.Td ? /** @type {any[]} */ ([[html`Derivative time Td <small>s</small>`, "td", old?.Td, gains.Td, significant]]) : []),
     ...(weight(old) || weight(gains) ? /** @type {any[]} */ ([[html`Set-point weight b`, "b", old?.b, gains.b, (/** @type {any} */ v) => significant(v, 3)]]) : []),
     [html`Overshoot <small>%</small>`, "os", stable ? a.overshoot_pct : null, b.overshoot_pct, (v) => fixed(v, 0)],
-    [html`Settled within 5 % <small>s${atMost(job.comparison?.settling_s_asked)}</small>`, "settle", stable ? a.setpoint?.settling_s : null, b.setpoint?.settling_s, (v) => significant(v, 2)],
-    ...(known(job.comparison?.mv_peak_asked) && atTested ? /** @type {any[]} */ ([[html`MV moved after a step <small>%/${u}${atMost(job.comparison.mv_peak_asked)}</small>`, "mv", stable ? a.setpoint?.mv_peak : null, b.setpoint?.mv_peak, significant]]) : []),
-    [html`Load of 1 %, IAE <small>${u} s</small>`, "iae", stable ? a.load?.IAE : null, b.load?.IAE, (v) => significant(v, 3)],
+    [html`Settled within 5 % <small>s${atMost(atTested ? job.comparison?.settling_s_asked : null)}</small>`, "settle", stable ? a.setpoint?.settling_s : null, b.setpoint?.settling_s, (v) => significant(v, 2)],
+    ...(known(job.comparison?.mv_peak_asked) ? /** @type {any[]} */ ([[html`MV moved after a step <small>%/${u}${atMost(job.comparison.mv_peak_asked)}</small>`, "mv", stable ? a.setpoint?.mv_peak : null, b.setpoint?.mv_peak, significant]]) : []),
+    [html`Load of ${LOAD_PCT} %, IAE <small>${u} s</small>`, "iae", stable ? load(a) : null, load(b), (v) => significant(v, 3)],
     [html`Largest sensitivity Ms ${known(uncertain) && html`<small>± ${msError(uncertain)}</small>`}`, "ms", stable ? a.Ms : null, b.Ms, msText],
     [html`The plant's gain may grow`, "gm", stable ? a.GM : null, b.GM, (v) => (known(v) ? `× ${fixed(v, 2)}` : "–")],
-    [html`Its dead time may grow by <small>s</small>`, "dm", stable ? before?.freq.delay_margin_s : null, after?.freq.delay_margin_s, (v) => significant(v, 3)],
+    [html`Its dead time may grow by <small>s</small>`, "dm", stable ? dm : null, dmAfter, (v) => significant(v, 3)],
     [html`Phase margin <small>°</small>`, "pm", stable ? a.PM_deg : null, b.PM_deg, (v) => fixed(v, 0)],
   ];
   return html`<table class="figures" key="table"><caption class="hidden-words">Before and after, for a set-point step of ${size} ${u}</caption>

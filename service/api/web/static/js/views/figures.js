@@ -36,15 +36,19 @@ function heightOf(width) {
   return Math.round(Math.min(240, Math.max(150, 0.65 * width)));
 }
 
-/** @param {number} W width in pixels @param {any} before @param {any} after @param {number} setpoint @param {string} label */
-export function StepPlot(W, before, after, setpoint, label) {
+/**
+ * @param {number} W width in pixels @param {import("../designs.js").StepCurve | null} before @param {import("../designs.js").StepCurve} after
+ * @param {number} size of the step @param {boolean} ofSetpoint @param {string} label
+ */
+export function StepPlot(W, before, after, size, ofSetpoint, label) {
+  const setpoint = ofSetpoint ? size : 0;
   const [H, L, B] = [heightOf(W), 46, 20];
   let low = Math.min(0, setpoint);
   let high = Math.max(0, setpoint);
   const consider = before ? [before, after] : [after];
-  for (const each of consider) for (const value of each.y) {
-    low = Math.min(low, value);
-    high = Math.max(high, value);
+  for (const each of consider) for (const value of each.pv) {
+    low = Math.min(low, size * value);
+    high = Math.max(high, size * value);
   }
   if (setpoint) {
     low = Math.max(low, -Math.abs(setpoint));
@@ -53,14 +57,11 @@ export function StepPlot(W, before, after, setpoint, label) {
   const pad = (high - low) * 0.06 || 1;
   low -= pad;
   high += pad;
-  const end = after.t[after.t.length - 1];
+  const end = after.horizon_s;
   const x = (/** @type {number} */ t) => L + ((W - L - 4) * t) / end;
   const y = (/** @type {number} */ v) => 6 + (H - B - 6) * (1 - (Math.min(high, Math.max(low, v)) - low) / (high - low));
-  const path = (/** @type {any} */ found) => {
-    let d = "";
-    for (let n = 0; n < found.t.length; n += 2) d += `${n ? "L" : "M"}${x(found.t[n]).toFixed(1)} ${y(found.y[n]).toFixed(1)}`;
-    return d;
-  };
+  const path = (/** @type {import("../designs.js").StepCurve} */ found) =>
+    found.pv.map((value, n) => `${n ? "L" : "M"}${x((n * found.horizon_s) / (found.pv.length - 1)).toFixed(1)} ${y(size * value).toFixed(1)}`).join("");
   const dy = tickDistance(high - low, 4);
   const dx = tickDistance(end, 4);
   const ys = [];
@@ -74,17 +75,17 @@ export function StepPlot(W, before, after, setpoint, label) {
     ${before && html`<path key="before" d=${path(before)} class="s-old" />`}<path key="after" d=${path(after)} class="s-new" /></svg>`;
 }
 
-/** @param {number} width in pixels @param {any} before @param {any} after @param {number} Ms */
+/** @param {number} width in pixels @param {import("../designs.js").Curves | null} before @param {import("../designs.js").Curves} after @param {number} Ms */
 export function NyquistPlot(width, before, after, Ms) {
   const [W, H] = [width, heightOf(width * 1.25)];
   const scale = 0.34 * Math.min(H, W);
   const x = (/** @type {number} */ re) => 0.59 * W + scale * re;
   const y = (/** @type {number} */ im) => 0.365 * H - scale * im;
-  const path = (/** @type {any} */ f) => {
+  const path = (/** @type {import("../designs.js").Curves} */ f) => {
     let d = "";
     let pen = false;
-    for (let n = 0; n < f.re.length; n += 2) {
-      const [px, py] = [x(f.re[n]), y(f.im[n])];
+    for (let n = 0; n < f.nyquist_re.length; n++) {
+      const [px, py] = [x(f.nyquist_re[n]), y(f.nyquist_im[n])];
       if (px < -60 || px > W + 60 || py < -60 || py > H + 60) {
         pen = false;
         continue;

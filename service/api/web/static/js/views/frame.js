@@ -11,6 +11,7 @@ import { loopPath, path } from "../router.js";
 import { isSilent, jobs, may, newerVersion, service, session, silent_s } from "../state.js";
 import { AlarmSymbol } from "../symbols.js";
 import { stageName } from "../words.js";
+import { keysShown } from "./keys.js";
 
 const PLACES = [["/ui/", "Loops"], ["/ui/jobs", "Jobs"], ["/ui/retunes", "Retunes"]];
 
@@ -31,6 +32,7 @@ export function Bar() {
         ${some.length ? some.map(([level, count]) => html`<span key=${level} class="count">${AlarmSymbol(/** @type {1|2|3} */ (level))} ${count}</span>`) : html`<svg class="calm-sign" viewBox="0 0 20 20" aria-hidden="true"><path d="M10 2.5 18 17H2Z" class="s-line" /></svg><span class="calmness">${all ? "Nothing abnormal" : "…"}</span>`}
       </a>
       <span class="who">${session.value && html`${service.value && service.value.host !== session.value.name ? `${service.value.host} · ` : ""}<b>${session.value.name}</b> · ${session.value.scope}`}</span>
+      <button class="plain" onClick=${() => (keysShown.value = !keysShown.value)} aria-label="Keys" aria-keyshortcuts="?" title="keys of this page">?</button>
       <button class="plain" onClick=${cyclePalette} aria-label=${`Colours: ${palette.value}`}>◑ <span class="who">${palette.value}</span></button>
       ${signOutError.value && html`<span key="error" role="alert">${signOutError.value}</span>`}
       ${session.value?.keys && html`<button key="out" class="plain" onClick=${signOut} aria-label=${`Sign out ${session.value.name}`}>Sign out</button>`}
@@ -55,7 +57,7 @@ async function signOut() {
 export function Banner() {
   if (isSilent.value) {
     return html`<div class="banner" role="alert" key="silent">${AlarmSymbol(2)}
-      <span><b>No word from the service for ${silent_s.value} s.</b> What is shown is old. Tests that run go on, guarded by the gateway and the controllers.</span></div>`;
+      <span><b>No word from the service for ${silent_s.value} s.</b> What is shown is old. If the service has ended, it has ended its tests too, or the controllers do so by themselves, and the loops are as before; if only this screen has lost it, tests go on.</span></div>`;
   }
   if (newerVersion.value) {
     return html`<div class="banner calm" role="status" key="newer"><span>Loopwright was updated.</span><button onClick=${() => location.reload()}>Reload</button></div>`;

@@ -11,7 +11,7 @@ const KEYS = [
   ["j k Enter", "next row, previous row, open"],
   ["g l, g j, g a", "Loops, Jobs, Abnormal"],
   ["1 … 4, t", "windows of the trend, the test"],
-  ["arrows, Home, End", "the slider; with Shift in larger steps"],
+  ["arrows, Home, End", "the slider, from one design to the next"],
   ["Esc", "closes a form or a question; the slider goes back"],
   ["?", "this list"],
 ];

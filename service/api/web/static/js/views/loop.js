@@ -1,13 +1,13 @@
 // @ts-check
 /** One loop: its face, trend, gains, limits, what is known of its plant, its tests; the test under way; the latest result. */
-import { useEffect, useState } from "../../vendor/hooks.js";
+import { useEffect, useRef, useState } from "../../vendor/hooks.js";
 import { abnormalNow } from "../alarms.js";
-import { ask, askPage } from "../api.js";
+import { ask, askPage, command } from "../api.js";
 import { GatewayName, isElsewhere, refreshGateways } from "../gateways.js";
 import { html } from "../html.js";
 import { known, ms, period, pvDecimals, fixed, significant, unit, when } from "../numbers.js";
 import { jobPath } from "../router.js";
-import { isSilent, jobs, loops, loopsError, may, rowOf } from "../state.js";
+import { isSilent, jobs, loops, loopsError, may, refreshLoops, rowOf, sign, signature } from "../state.js";
 import { AlarmSymbol } from "../symbols.js";
 import { sentence, stateWords, weight } from "../words.js";
 import { Face } from "./face.js";
@@ -103,12 +103,12 @@ export function LoopView({ tag }) {
       ${asking.value === each.id && html`<${SignOffQuestion} key="question" alarm=${each} />`}</div>`)}
     ${elsewhere && row?.not_heard && !isSilent.value && !mine.some((each) => each.kind === "gateway_silent") && html`<p class="refusal" key="gateway" role="status"><b>${row.not_heard}.</b></p>`}
     ${detail?.not_confirmed_home && html`<p class="refusal" key="home">${sentence(detail.not_confirmed_home.advice)}</p>`}
-    ${loop.locked && html`<p class="refusal" key="lock">Locked by ${loop.locked.by} since ${when(loop.locked.since)}: ${loop.locked.reason}. Tests and decisions wait until it is unlocked.</p>`}
+    ${loop.locked && html`<p class="refusal" key="lock">Locked by ${loop.locked.by} since ${when(loop.locked.since)}: ${loop.locked.reason}. Tests and decisions wait until it is unlocked. ${may.operate.value && html`<${Unlock} key="unlock" tag=${tag} />`}</p>`}
     <div class="loop" key="loop">
       <aside key="aside"><${Face} key="face" loop=${loop} />${Settings(loop, detail)}<${Known} key="known" loop=${loop} detail=${detail} />${Tests(tests)}</aside>
       <div key="right">
         <${Trend} key="trend" loop=${loop} job=${job} height=${height} onJob=${onJob} />
-        ${formOpen && html`<${RetuneForm} key="form" loop=${loop} onClose=${result ? () => { setOpen(false); focusOpener(); } : null} onStarted=${() => setOpen(false)} />`}
+        ${formOpen && html`<${RetuneForm} key="form" loop=${loop} onClose=${result ? () => { setOpen(false); focusOpener(); } : null} onStarted=${() => { setOpen(false); focusTest(); }} />`}
         ${job && html`<${UnderTest} key="test" loop=${loop} live=${job} job=${running?.id === job.id ? running : null} />`}
         ${!job && result && !isLatest && html`<p key="asking" class="quiet" role="status">Asking for the result…</p>`}
         ${!job && result && isLatest && html`<${Result} key=${`result ${result.id}`} loop=${loop} detail=${detail} job=${result} quiet=${formOpen} onChanged=${setResult} />`}
@@ -120,6 +120,38 @@ export function LoopView({ tag }) {
 /** The focus goes back to what opened the form, once it is drawn again. */
 function focusOpener() {
   requestAnimationFrame(() => requestAnimationFrame(() => document.getElementById("retune")?.focus()));
+}
+
+/** The question that unlocks a loop, signed. @param {{tag: string}} props */
+function Unlock({ tag }) {
+  const [asking, setAsking] = useState(false);
+  const [problem, setProblem] = useState("");
+  const field = useRef(/** @type {HTMLInputElement | null} */ (null));
+  useEffect(() => field.current?.focus(), [asking]);
+  const dead = isSilent.value || !signature.value.trim();
+  const send = async () => {
+    try {
+      await command(`/loops/${encodeURIComponent(tag)}/unlock`, { by: signature.value.trim() });
+      setAsking(false);
+      void refreshLoops();
+    } catch (error) {
+      setProblem(/** @type {Error} */ (error).message);
+    }
+  };
+  const keys = (/** @type {KeyboardEvent} */ e) => {
+    if (e.key === "Enter" && !dead) void send();
+    if (e.key === "Escape") setAsking(false);
+  };
+  if (!asking) return html`<button class="plain" onClick=${() => setAsking(true)}>Unlock…</button>`;
+  return html`<span class="ask" role="group" aria-label=${`Unlock ${tag}`}><label>Signed <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${keys} /></label>
+    <button onClick=${() => setAsking(false)}>Cancel</button><button class="main" disabled=${dead} onClick=${send}>Unlock ${tag}</button>${problem && html` <span role="alert">${problem}</span>`}</span>`;
+}
+
+/** The focus goes from the form, which is gone, to the test that it has started, once it is drawn. */
+function focusTest(tries = 40) {
+  const test = document.getElementById("under-test");
+  if (test) test.focus({ preventScroll: true });
+  else if (tries && (document.activeElement === document.body || !document.activeElement)) setTimeout(() => focusTest(tries - 1), 100);
 }
 
 /** @param {any} loop @param {any} detail */

@@ -6,7 +6,7 @@ import { html } from "../html.js";
 import { pvDecimals, fixed, unit } from "../numbers.js";
 import { colour, shown } from "../palette.js";
 import { makePlot, mark, yRange } from "../plot.js";
-import { stageName } from "../words.js";
+import { markName } from "../words.js";
 
 /** @param {{loop: any, job: any}} props */
 export function Record({ loop, job }) {
@@ -35,11 +35,11 @@ export function Record({ loop, job }) {
     const marks = (/** @type {any} */ u, /** @type {any} */ ctx, /** @type {boolean} */ named) => {
       let last = -Infinity;
       let row = 0;
-      for (const each of record.marks) {
+      for (const [n, each] of record.marks.entries()) {
         const at = u.valToPos(each.t, "x", true);
         row = at - last < 95 * devicePixelRatio ? row + 1 : 0;
         last = at;
-        mark(u, ctx, each.t, named ? stageName(each.stage) : "", row);
+        mark(u, ctx, each.t, named ? markName(record.marks, n) : "", row);
       }
     };
     const common = { zero: () => 0, sync: key, onSelect: (/** @type {number} */ from, /** @type {number} */ to) => { x = [from, to]; draw(); },

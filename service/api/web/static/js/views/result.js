@@ -61,7 +61,7 @@ function Numbers(loop, job) {
   const rows = [];
   const m = job.model;
   const list = (/** @type {number[]} */ values, /** @type {number[] | null} */ errors) => values.map((value, n) => withError(value, errors?.[n])).join(", ");
-  if (m?.num) rows.push(["model", m.structure === "typed in" ? "given with the request" : m.structure], ["numerator", list(m.num, m.num_errors)], ["denominator", list(m.den, m.den_errors)], ["dead time", withUnit(withError(m.dead_time_s, m.dead_time_error_s), "s")]);
+  if (m?.num) rows.push(["model", m.structure === "typed in" ? "given with the request" : m.integrating ? `integrating as far as the record shows (${m.structure})` : m.structure], ["numerator", list(m.num, m.num_errors)], ["denominator", list(m.den, m.den_errors)], ["dead time", withUnit(withError(m.dead_time_s, m.dead_time_error_s), "s")]);
   else if (m) rows.push(["model", `K ${significant(m.K)} ${u}/%, T ${significant(m.T_s)} s, dead time ${significant(m.L_s)} s${known(m.zeta) ? `, damping ${significant(m.zeta)}` : ""}`]);
   if (known(m?.fit_pct)) rows.push(["fit", `${fixed(m.fit_pct, 1)} %`]);
   if (job.ultimate) rows.push(["ultimate point", `Ku ${significant(job.ultimate.Ku)} %/${u}, Pu ${significant(job.ultimate.Pu_s)} s`]);

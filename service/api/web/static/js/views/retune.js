@@ -83,6 +83,7 @@ export function RetuneForm({ loop, onClose, onStarted }) {
   const obstacle = preview?.obstacles.find((/** @type {any} */ each) => !PASSING.includes(each.reason));
   const unsigned = !signature.value.trim();
   const why = isSilent.value ? "The service is silent." : bad ? bad : obstacle ? "" : unsigned ? "Who signs?" : "";
+  const dead = sending || !!why || !!obstacle;
   const u = unit(loop.pv_unit);
   return html`<section class="card" aria-label="Retune" style=${{ marginTop: "16px" }}>
     <div class="split" key="top"><h2 class="title">Retune</h2>${onClose && html`<button class="plain" aria-label="Close the form" onClick=${onClose}>✕</button>`}</div>
@@ -95,30 +96,41 @@ export function RetuneForm({ loop, onClose, onStarted }) {
       <label class="field"><span>Procedure</span><select class="wide" value=${form.method} onChange=${set("method")}>
         <option value="fast">fast: one record</option><option value="setpoint">set-point pulses</option><option value="five-stage">five-stage</option>
         ${methods.filter((each) => !["fast", "setpoint", "five-stage", "observe"].includes(each.method)).map((each) => html`<option key=${each.method} value=${each.method}>${each.title ?? each.method}</option>`)}</select></label>
-      ${form.method === "fast" && Field("amplitude_pct", "Relay up by", "%", preview?.first_mv_move_pct, form, set, problem)}
-      ${Field("mv_low", "MV not below", "%", loop.mv_limits.low, form, set, problem)}${Field("mv_high", "MV not above", "%", loop.mv_limits.high, form, set, problem)}
-      ${Field("pv_low", "Abort below", u, loop.pv_limits.low, form, set, problem)}${Field("pv_high", "Abort above", u, loop.pv_limits.high, form, set, problem)}
-      ${Field("sp_deviation", "SP step", u, loop.sp_deviation, form, set, problem)}
+      ${form.method === "fast" && Field("amplitude_pct", "%", preview?.first_mv_move_pct, form, set, problem)}
+      ${Field("mv_low", "%", loop.mv_limits.low, form, set, problem)}${Field("mv_high", "%", loop.mv_limits.high, form, set, problem)}
+      ${Field("pv_low", u, loop.pv_limits.low, form, set, problem)}${Field("pv_high", u, loop.pv_limits.high, form, set, problem)}
+      ${Field("sp_deviation", u, loop.sp_deviation, form, set, problem)}
       ${designed && html`<label class="check"><input type="checkbox" checked=${!!form.derivative} onChange=${set("derivative")} /> derivative, where it pays</label>`}
       ${designed && html`<label class="field"><span>The best for</span><select class="wide" value=${form.aim ?? "balanced"} onChange=${set("aim")}>
         <option value="balanced">set-point and load alike</option><option value="setpoint">set-point steps</option><option value="load">load disturbances</option><option value="no_overshoot">both, without overshoot</option></select></label>`}
-      ${designed && Field("settling_s", "Settled within 5 % in", "s", null, form, set, problem)}
-      ${designed && Field("mv_peak", "MV moved at most by", `% per ${u}`, null, form, set, problem)}
+      ${designed && Field("settling_s", "s", null, form, set, problem)}
+      ${designed && Field("mv_peak", `% per ${u}`, null, form, set, problem)}
       ${form.method === "fast" && html`<label class="check"><input type="checkbox" checked=${!!form.careful} onChange=${set("careful")} /> careful: six switches at least</label>`}
       <label class="check"><input type="checkbox" checked=${!!form.dry_run} onChange=${set("dry_run")} /> rehearsal: computed in memory, nothing is moved</label>
     </div>`}
-    ${preview?.obstacles.map((/** @type {any} */ each) => html`<div class="refusal" key=${each.reason}><p>${sentence(each.detail)} <span class="advice">${each.advice}</span> ${each.job && html`<a href=${jobPath(each.job)}>to that job</a>`}</p></div>`)}
-    ${problem && html`<div class="refusal" role="alert" key="problem"><p>${sentence(problem.message)} <span class="advice">${problem.advice}</span> ${problem.job && html`<a href=${jobPath(problem.job)}>to that job</a>`}</p></div>`}
-    <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} /></label>
+    ${preview?.obstacles.map((/** @type {any} */ each) => html`<div class="refusal" key=${each.reason}><p>${asNamed(each.detail)} <span class="advice">${each.advice}</span> ${each.job && html`<a href=${jobPath(each.job)}>to that job</a>`}</p></div>`)}
+    ${problem && html`<div class="refusal" role="alert" key="problem"><p>${asNamed(problem.message)} <span class="advice">${problem.advice}</span> ${problem.job && html`<a href=${jobPath(problem.job)}>to that job</a>`}</p></div>`}
+    <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && !dead) void start(); }} /></label>
       <span class="quiet" role="status">${why}</span>
-      <button class="main" disabled=${sending || !!why || !!obstacle} onClick=${start}>${form.dry_run ? "Rehearse" : "Retune"} ${loop.tag}</button></div>
+      <button class="main" disabled=${dead} onClick=${start}>${form.dry_run ? "Rehearse" : "Retune"} ${loop.tag}</button></div>
   </section>`;
 }
 
-/** @param {string} name @param {string} label @param {string} u @param {number | null | undefined} usual @param {any} form @param {any} set @param {any} problem */
-function Field(name, label, u, usual, form, set, problem) {
+/** @param {string} name @param {string} u @param {number | null | undefined} usual @param {any} form @param {any} set @param {any} problem */
+function Field(name, u, usual, form, set, problem) {
   const wrong = problem?.errors?.find((/** @type {any} */ each) => each.where.endsWith(name)) || Number.isNaN(entered(form[name] ?? ""));
-  return html`<label class="field" key=${name}><span>${label}</span><span><input type="text" inputmode="decimal" value=${form[name] ?? ""} placeholder=${known(usual) ? significant(usual) : ""} aria-invalid=${wrong ? "true" : undefined} onInput=${set(name)} /> ${u}</span></label>`;
+  return html`<label class="field" key=${name}><span>${LABELS[name]}</span><span><input type="text" inputmode="decimal" value=${form[name] ?? ""} placeholder=${known(usual) ? significant(usual) : ""} aria-invalid=${wrong ? "true" : undefined} onInput=${set(name)} /> ${u}</span></label>`;
+}
+
+/** How the form names the fields of a request. @type {Record<string, string>} */
+const LABELS = {
+  amplitude_pct: "Relay up by", mv_low: "MV not below", mv_high: "MV not above", pv_low: "Abort below", pv_high: "Abort above",
+  sp_deviation: "SP step", settling_s: "Settled within 5 % in", mv_peak: "MV moved at most by",
+};
+
+/** A message of the service, with the fields named as the form names them. @param {string | null | undefined} text */
+function asNamed(text) {
+  return sentence((text ?? "").replace(/\b[a-z]+(?:_[a-z]+)+\b/g, (name) => (LABELS[name] ? `“${LABELS[name]}”` : name)));
 }
 
 const NUMBERS = ["mv_low", "mv_high", "pv_low", "pv_high", "sp_deviation"];
@@ -128,12 +140,13 @@ const REQUIREMENTS = ["settling_s", "mv_peak"];
 function bodyOf(form) {
   /** @type {Record<string, any>} */
   const body = { method: form.method };
-  let bad = "";
+  /** @type {string[]} */
+  const wrong = [];
   const designed = form.method === "fast" || form.method === "setpoint";
   const names = [...NUMBERS, ...(designed ? REQUIREMENTS : []), ...(form.method === "fast" ? ["amplitude_pct"] : [])];
   for (const name of names) {
     const value = entered(String(form[name] ?? ""));
-    if (Number.isNaN(value)) bad = "A field is not a number.";
+    if (Number.isNaN(value)) wrong.push(LABELS[name]);
     else if (value !== null) body[name] = value;
   }
   if (designed) {
@@ -143,6 +156,7 @@ function bodyOf(form) {
   }
   if (form.method === "fast" && form.careful) body.careful = true;
   if (form.dry_run) body.dry_run = true;
+  const bad = wrong.length ? `Not a number: ${wrong.map((each) => `“${each}”`).join(", ")}.` : "";
   return { body, bad };
 }
 

@@ -109,6 +109,7 @@ function Form() {
     }
   };
   const on = (/** @type {(v: string) => void} */ set) => (/** @type {any} */ e) => set(e.target.value);
+  const dead = sending || isSilent.value || !!bad || !isOfThis || !preview?.would_start || !signature.value.trim();
   return html`<section class="card" aria-label="Retune many loops"><h2 class="title" key="t">Retune many</h2>
     <div class="options" key="fields" style=${{ borderTop: 0, marginTop: 0 }}>
       <label class="field"><span>Loops</span><input type="text" class="wide" placeholder="TIC-* or *" value=${pattern} onInput=${on(setPattern)} /></label>
@@ -119,9 +120,9 @@ function Form() {
     ${preview && html`<div key="what" class="explain">${preview.summary.map((/** @type {string} */ line) => html`<p key=${line}>${line}</p>`)}</div>`}
     ${preview?.loops.filter((/** @type {any} */ each) => !each.would_start).map((/** @type {any} */ each) => html`<p class="note" key=${each.loop}><b>${each.loop}</b> ${each.obstacles[0]?.detail}. ${each.obstacles[0]?.advice}</p>`)}
     ${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice}</span></p>`}
-    <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} /></label>
+    <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && !dead) void start(); }} /></label>
       <span class="quiet" role="status">${bad}</span>
-      <button class="main" disabled=${sending || isSilent.value || !!bad || !isOfThis || !preview?.would_start || !signature.value.trim()} onClick=${start}>${preview ? `Retune ${preview.would_start} ${preview.would_start === 1 ? "loop" : "loops"}` : "Retune"}</button></div></section>`;
+      <button class="main" disabled=${dead} onClick=${start}>${preview ? `Retune ${preview.would_start} ${preview.would_start === 1 ? "loop" : "loops"}` : "Retune"}</button></div></section>`;
 }
 
 /** @param {{id: string}} props */

@@ -34,7 +34,7 @@ export function Trend({ loop, job, height, onJob }) {
   const held = useRef(/** @type {any} */ (null));
   if (!held.current) {
     held.current = {
-      ring: new Ring(), window_s: 120, test: false, zoom: null, stages: [], job: null, dirty: true,
+      ring: new Ring(), window_s: 120, test: false, zoom: null, stages: [], job: null, dirty: true, pace: 1, begun_s: NaN,
       chosen: signal("2 min"), zoomed: signal(false), at: signal(/** @type {any} */ (null)),
     };
   }
@@ -42,13 +42,18 @@ export function Trend({ loop, job, height, onJob }) {
   const testing = job && job.state === "running" && !job.dry_run;
   if (testing && it.job?.id !== job.id) {
     it.began_s = now_s.peek() - (job.plant_time_s ?? 0);
+    it.begun_s = NaN;
+    it.pace = 1;
     it.stages = [];
     it.test = true;
     it.zoom = null;
     it.chosen.value = "test";
     it.zoomed.value = false;
   }
-  if (testing) it.job = job;
+  if (testing) {
+    it.job = job;
+    it.pace = paceOf(job.plant_time_s, now_s.peek() - it.begun_s);
+  }
   else if (it.job && !it.ended_s) it.ended_s = now_s.peek();
   if (testing) it.ended_s = 0;
 
@@ -88,11 +93,12 @@ export function Trend({ loop, job, height, onJob }) {
       }
     };
     const zero = () => (it.zoom ? null : it.test ? it.began_s : it.present_s);
+    const pace = () => (it.test && !it.zoom ? it.pace : 1);
     if (upper.current && lower.current) {
       plots = [
         makePlot(upper.current, {
           lines: [{ label: "SP", colour: "sp", dash: [6, 4], width: 1.2, stepped: true }, { label: "PV", colour: "pv" }],
-          height: Math.round(height * 0.64), withTime: false, zero, sync: key, onCursor, onSelect,
+          height: Math.round(height * 0.64), withTime: false, zero, pace, sync: key, onCursor, onSelect,
           beneath: (u, ctx) => {
             hatched(u, ctx, loop.pv_limits.high, u.scales.y.max);
             hatched(u, ctx, u.scales.y.min, loop.pv_limits.low);
@@ -101,7 +107,7 @@ export function Trend({ loop, job, height, onJob }) {
         }),
         makePlot(lower.current, {
           lines: [{ label: "MV", colour: "mv", stepped: true }],
-          height: Math.round(height * 0.36) + 24, withTime: true, zero, sync: key, onCursor, onSelect,
+          height: Math.round(height * 0.36) + 24, withTime: true, zero, pace, sync: key, onCursor, onSelect,
           beneath: (u, ctx) => {
             hatched(u, ctx, loop.mv_limits.high, u.scales.y.max);
             hatched(u, ctx, u.scales.y.min, loop.mv_limits.low);
@@ -119,7 +125,7 @@ export function Trend({ loop, job, height, onJob }) {
       let x = [end - it.window_s, end];
       if (it.zoom) x = it.zoom;
       else if (it.test && it.began_s) {
-        const remaining = it.ended_s ? 0 : (it.job?.remaining_plant_time_s ?? 20);
+        const remaining = it.ended_s ? 0 : (it.job?.remaining_plant_time_s ?? 20) / it.pace;
         const to = it.ended_s ? Math.max(it.ended_s, it.began_s + 5) + 5 : Math.max(end + remaining, it.began_s + 10);
         it.test_end_s = it.ended_s ? to : Math.max(to, (it.test_end_s ?? 0) > end ? it.test_end_s : 0);
         x = [it.began_s - 2, it.ended_s ? to : it.test_end_s];
@@ -176,7 +182,7 @@ export function Trend({ loop, job, height, onJob }) {
           if (it.stagesOf !== event.job || event.kind === "resumed") it.stages = [];
           it.stagesOf = event.job;
           if (event.kind !== "resumed" && !it.stages.some((/** @type {any} */ each) => each.at_s === at_s)) it.stages = [...it.stages, { at_s, stage: event.data.stage }];
-          if (it.stages.length === 1) it.began_s = it.stages[0].at_s;
+          if (it.stages.length === 1) it.began_s = it.begun_s = it.stages[0].at_s;
           it.dirty = true;
         }
         onJob(event);
@@ -233,9 +239,18 @@ export function Trend({ loop, job, height, onJob }) {
     ${isElsewhere(loop) && html`<p class="note" key="elsewhere">Samples as they come are at ${GatewayName(loop)}; here is a value a second, and of the past what it has stored.</p>`}
     <span class="axis-name" key="n1">PV, ${unit(loop.pv_unit)}</span>
     <div class="plot" key="p1" ref=${upper} role="img" aria-label=${`PV and set-point of ${loop.tag}`}></div>
-    <span class="axis-name" key="n2">MV, %</span>
+    <span class="axis-name" key="n2">MV, %${it.pace !== 1 && it.chosen.value === "test" && !it.zoomed.value ? "; the time is plant time since the test began" : ""}</span>
     <div class="plot" key="p2" ref=${lower} role="img" aria-label=${`MV of ${loop.tag}`}></div>
   </section>`;
+}
+
+/**
+ * How many seconds of plant time a second is, of a test that has run for a while; 1 where both are about the same.
+ * @param {number} plant_s @param {number} wall_s
+ */
+function paceOf(plant_s, wall_s) {
+  const pace = wall_s > 0.5 && plant_s > 0 ? plant_s / wall_s : 1;
+  return pace > 0.8 && pace < 1.25 ? 1 : pace;
 }
 
 /** Lowest and highest of each bin, evenly in time. @param {Ring} ring @param {any} past @param {number} begin_s */
