@@ -10,7 +10,7 @@ from fastapi.responses import JSONResponse
 from loopwright.service.alarms.alarm import Alarm, AlarmList
 from loopwright.service.alarms.watch import FRESH_S, AlarmWatch, NoSuchAlarm
 from loopwright.service.api import problems
-from loopwright.service.api.job_views import Decision
+from loopwright.service.api.job_views import Decision, signed_by
 from loopwright.service.api.routes import add, new_router
 
 AlarmId = Annotated[str, Path(description="Id of the alarm", examples=["0f3ac2d9be11"])]
@@ -36,7 +36,7 @@ def install(app: FastAPI, watch: AlarmWatch) -> None:
         responses=problems.responses(404, 409, 422),
     )
     def sign_off_alarm(alarm_id: AlarmId, decision: Annotated[Decision | None, Body()] = None) -> Alarm:
-        return watch.sign_off(alarm_id, (decision or Decision()).by)
+        return watch.sign_off(alarm_id, signed_by(decision))
 
     add(app, router)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from loopwright.service.api.watch_views import WatchView
 from loopwright.service.inputs.config import Limits, LoopConfig, PermittedTest
@@ -28,6 +28,7 @@ from loopwright.service.results import (
     VerificationView,
     empty_result,
 )
+from loopwright.service.security.principal import signed
 from loopwright.service.states.acceptance_watch import AcceptanceWatch
 from loopwright.service.states.job_state import ACTIVE, JobState, shown
 from loopwright.service.states.loop_state import LoopState, gains_of, same_gains
@@ -398,7 +399,11 @@ class SamplesView(BaseModel):
 class Decision(BaseModel):
     """The person who decides, for the audit trail."""
 
-    by: str = Field(default="api", max_length=100, examples=["operator A"])
+    model_config = ConfigDict(strict=True)
+
+    by: str | None = Field(
+        default=None, max_length=100, description="The default is the name of the key", examples=["operator A"]
+    )
 
 
 class AcceptDecision(Decision):
@@ -409,6 +414,11 @@ class AcceptDecision(Decision):
         description="Put the old gains back by itself if, while the loop is watched, PV leaves its limits or an "
         "oscillation near the crossover grows over three periods, and nobody has changed gains or mode since",
     )
+
+
+def signed_by(decision: Decision | None) -> str:
+    """The name under which a decision is noted."""
+    return signed(None if decision is None else decision.by)
 
 
 def loop_view(

@@ -16,7 +16,6 @@ from typing import Annotated, Literal, Self
 from pydantic import (
     BaseModel,
     BeforeValidator,
-    ConfigDict,
     Discriminator,
     Field,
     JsonValue,
@@ -27,7 +26,7 @@ from pydantic import (
 )
 
 from loopwright.service.inputs.plausible import MAX_TIME_S, MIN_TIME_S, Implausible, check_damping, check_model
-from loopwright.service.inputs.validation import branch, branch_of, did_you_mean, lines
+from loopwright.service.inputs.validation import STRICT, branch, branch_of, did_you_mean, lines
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 
 MAX_COEFFICIENTS = 12
@@ -126,7 +125,7 @@ Coefficients = Annotated[
 
 
 class _Form(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = STRICT
 
     def plant(self) -> Model:
         """The model as an object of `tuning`."""

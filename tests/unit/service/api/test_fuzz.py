@@ -131,7 +131,7 @@ class Site:
     def retune(self, new: bool) -> str:
         """A retune of many loops that is open; the service's thread for them does not run here."""
         if new or not self.retunes:
-            self.retunes.append(self.client.post("/retunes", json={"pattern": "*"}).json()["id"])
+            self.retunes.append(self.client.post("/retunes", json={"requested_by": "me", "pattern": "*"}).json()["id"])
         return self.retunes[-1]
 
     def alarm(self) -> str:

@@ -94,7 +94,7 @@ def an_abort(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]
 
 def an_abort_of_many(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
     service.tune.hold.clear()
-    found = client.post("/retunes", json={"pattern": "*"}).json()
+    found = client.post("/retunes", json={"requested_by": "me", "pattern": "*"}).json()
     assert service.tune.inside.wait(10)
     return f"{found['url']}/abort", {}
 

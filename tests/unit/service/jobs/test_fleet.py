@@ -488,7 +488,7 @@ def test_a_retune_of_many_over_http(plant: Plant, client: TestClient) -> None:
     assert client.post(f"{body['url']}/abort").status_code == 409
     assert client.get("/retunes/none").status_code == 404
     assert client.post("/retunes/none/abort").status_code == 404
-    refused = client.post("/retunes", json={"loops": ["Z"]})
+    refused = client.post("/retunes", json={"requested_by": "me", "loops": ["Z"]})
     assert refused.status_code == 422 and refused.json()["reason"] == "bad_input"
     assert [one["id"] for one in client.get("/retunes").json()] == [body["id"]]
 

@@ -122,7 +122,7 @@ def test_scopes(keyring: Keyring, open_client: Open, has: Scope, service: Servic
     client = open_client(keyring, key=keyring.create(has, has)[1])
     may_operate, may_admin = has in ("operate", "admin"), has == "admin"
     assert client.get("/loops").status_code == 200
-    answer = client.post(f"/loops/{TAG}/retune", json={})
+    answer = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"})
     assert answer.status_code == (202 if may_operate else 403)
     if not may_operate:
         assert "operate" in assert_problem(answer, 403)["detail"]
@@ -136,7 +136,7 @@ def test_no_key_no_answer(keyring: Keyring, open_client: Open, value: str) -> No
     answer = client.get("/loops", headers={"Authorization": value})
     assert_problem(answer, 401)
     assert answer.headers["www-authenticate"].startswith("Bearer")
-    assert_problem(client.post(f"/loops/{TAG}/retune", json={}), 401)
+    assert_problem(client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}), 401)
     assert_problem(client.get("/nowhere"), 401)
 
 
@@ -274,7 +274,7 @@ def test_every_change_is_written_down(service: Service, keyring: Keyring, open_c
     client.post(f"/jobs/{job}/accept")  # a 409 changes nothing
     client.post(f"/jobs/{job}/rollback")
     service.tune.hold.clear()
-    other = client.post(f"/loops/{TAG}/retune", json={}).json()["id"]
+    other = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()["id"]
     client.post(f"/jobs/{other}/abort")
     service.wait(other)
     found = trail(client)
@@ -295,7 +295,7 @@ def test_a_decision_that_failed_in_the_controller_is_written_down(
     service: Service, open_client: Open, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client = open_client()
-    job = client.post(f"/loops/{TAG}/retune", json={}).json()["id"]
+    job = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()["id"]
     service.wait(job)
     service.controller.absent = Reason.NODE_LOST
     assert client.post(f"/jobs/{job}/accept").status_code == 503
