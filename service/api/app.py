@@ -35,6 +35,7 @@ from loopwright.service.api import (
 from loopwright.service.api import live as live_api
 from loopwright.service.api.aborts import BODY, SaidBy, stopping
 from loopwright.service.api.bodies import JsonRoute, signed_test
+from loopwright.service.api.event_views import StoredEventView, event_view
 from loopwright.service.api.events import event_stream, still_permitted
 from loopwright.service.api.gate.access_log import Access, count_failures_of
 from loopwright.service.api.gate.gate import Gate, Policy
@@ -56,7 +57,7 @@ from loopwright.service.api.job_views import (
     loop_view,
     signed_by,
 )
-from loopwright.service.api.paging import LARGEST
+from loopwright.service.api.paging import LARGEST, LINK, Cursor, Limit, more
 from loopwright.service.api.routes import add, name_of
 from loopwright.service.api.samples import Reading, csv_text, json_text, parts
 from loopwright.service.api.watch_views import WatchView
@@ -262,8 +263,8 @@ def create_app(
         response_class=StreamingResponse,
         responses={
             200: {
-                "content": {"text/event-stream": {}},
-                "description": "Events: state, stage_started, stage_done, note, progress and interruptions of the job",
+                "content": {"text/event-stream": {"schema": {"$ref": "#/components/schemas/JobEventView"}}},
+                "description": "Events. The schema is that of the data of each; its kind is the event's name too",
             },
             204: {"description": "The job is over and the client has received every event; it should not reconnect"},
             **problems.responses(404, 422),
@@ -288,6 +289,21 @@ def create_app(
         permitted = still_permitted(keyring, policy.sessions, current.get())
         stream = event_stream(jobs, job_id, last_event_id, permitted, elsewhere, streams_over)
         return StreamingResponse(stream, media_type="text/event-stream", headers={"Cache-Control": "no-store"})
+
+    @app.get(
+        "/jobs/{job_id}/log",
+        tags=["jobs"],
+        summary="The stored events of a job, the first one first",
+        responses={**LINK, **problems.responses(404, 422)},
+    )
+    def list_job_events(
+        job_id: JobId, response: Response, limit: Limit = 200, cursor: Cursor = None
+    ) -> list[StoredEventView]:
+        jobs.store.get(job_id)
+        found = jobs.store.events(job_id, cursor or 0, limit + 1)
+        if len(found) > limit:
+            more(response, f"/jobs/{job_id}/log", found[limit - 1].seq, limit=limit)
+        return [event_view(each) for each in found[:limit]]
 
     @app.get(
         "/jobs/{job_id}/samples",

@@ -87,7 +87,7 @@ def test_a_key_that_may_read_has_no_button_that_changes_something(
 
     # a test that somebody else has begun is seen, and cannot be ended by this key
     _, operate = keyring.create("console", Scope.OPERATE)
-    answer = site.http.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}, headers={"Authorization": f"Bearer {operate}"})
+    answer = site.http.post(f"/loops/{TAG}/retune", json={}, headers={"Authorization": f"Bearer {operate}"})
     assert answer.status_code == 202
     expect(person.under_test(page)).to_be_visible()
     expect(person.dock(page)).to_contain_text(TAG)

@@ -149,7 +149,8 @@ class Measuring:
                     self._note_end(job)
                     if job["state"] == "proposed":
                         self._asked("POST", f"{url}/rollback")
-                answer = self._asked("POST", f"/loops/{tag}/retune", json={"requested_by": "me", "method": "five-stage"})
+                asked = {"requested_by": "me", "method": "five-stage"}
+                answer = self._asked("POST", f"/loops/{tag}/retune", json=asked)
                 if answer is not None and answer.status_code == 202:
                     self._jobs[tag] = answer.headers["location"]
             self._over.wait(1.0)

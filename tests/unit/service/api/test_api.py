@@ -20,7 +20,7 @@ GOLDEN = Path(__file__).parents[3] / "golden" / "openapi.json"
 
 
 def start(client: TestClient, **options: Any) -> str:
-    answer = client.post(f"/loops/{TAG}/retune", json=options)
+    answer = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"} | options)
     assert answer.status_code == 202, answer.text
     assert answer.headers["location"] == f"/jobs/{answer.json()['id']}"
     return str(answer.json()["id"])
@@ -266,7 +266,8 @@ def test_a_dry_run_touches_nothing_and_does_not_block(service: Service, client: 
 
 def test_stopping_takes_no_new_work(service: Service, client: TestClient) -> None:
     service.jobs.request_stop()
-    assert assert_problem(client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}), 503)["reason"] == "service_stopped"
+    answer = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"})
+    assert assert_problem(answer, 503)["reason"] == "service_stopped"
 
 
 def test_a_list_of_jobs_asks_the_database_as_often_however_long_it_is(service: Service, client: TestClient) -> None:

@@ -261,7 +261,7 @@ def test_a_bucket_fills_again() -> None:
 
 
 def trail(client: TestClient) -> list[dict[str, Any]]:
-    entries: list[dict[str, Any]] = client.get("/audit").json()["entries"]
+    entries: list[dict[str, Any]] = client.get("/audit").json()
     return entries
 
 
@@ -311,11 +311,11 @@ def test_the_audit_log_in_pages(keyring: Keyring, open_client: Open) -> None:
     client = open_client()
     seen, url = [], "/audit?limit=2&what=key_create"
     while url:
-        page = client.get(url).json()
-        seen += [entry["after"]["name"] for entry in page["entries"]]
-        url = page["next"]
+        page = client.get(url)
+        seen += [entry["after"]["name"] for entry in page.json()]
+        url = page.links.get("next", {}).get("url", "")
     assert seen == ["k4", "k3", "k2", "k1", "k0"]
-    assert client.get(f"/audit?loop={TAG}").json() == {"entries": [], "next": None}
+    assert client.get(f"/audit?loop={TAG}").json() == []
 
 
 def test_keys_and_audit_log_on_a_shared_database(tmp_path: Path, postgres: Server) -> None:
@@ -395,7 +395,7 @@ def test_keys_from_the_command_line(tmp_path: Path) -> None:
     assert run("key", "revoke", "shift", *data).exit_code == 2
     assert [k["valid"] for k in json.loads(run("key", "list", "--json", *data).stdout)] == [False, True]
     service = Service(tmp_path / "data")
-    rows = TestClient(create_app(service.jobs, checks={})).get("/audit").json()["entries"]
+    rows = TestClient(create_app(service.jobs, checks={})).get("/audit").json()
     assert [row["what"] for row in rows] == ["key_revoke", "key_create", "key_create"]
     assert all(row["who"].startswith("cli:") for row in rows)
     service.close()

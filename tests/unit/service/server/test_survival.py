@@ -68,7 +68,7 @@ class Gateway:
         (self.folder / (f"go-{stage}" if stage else "go")).touch()
 
     def retune(self, tag: str = TAG, **options: Any) -> str:
-        answer = self.http.post(f"/loops/{tag}/retune", json=options)
+        answer = self.http.post(f"/loops/{tag}/retune", json={"requested_by": "me"} | options)
         assert answer.status_code == 202, answer.text
         return str(answer.headers["location"])
 
@@ -401,7 +401,11 @@ def test_a_database_that_is_restarted_before_a_decision_is_carried_out(
     assert len((tmp_path / "a" / "A-1.accepted").read_text().split()) == 1
 
 
-@pytest.mark.parametrize(("path", "body"), [(f"/loops/{TAG}/retune", {"ms": 1.4}), ("/retunes", {"pattern": "*"})])
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [(f"/loops/{TAG}/retune", {"ms": 1.4, "requested_by": "me"}),
+     ("/retunes", {"pattern": "*", "requested_by": "me"})],
+)  # fmt: skip
 def test_killed_before_it_has_answered_a_repetition_with_the_key_begins_nothing_twice(
     stack: ExitStack, tmp_path: Path, database: str | None, path: str, body: dict[str, Any]
 ) -> None:
