@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -33,6 +34,12 @@ class Gains:
     Tf: float = 0.0
     b: float = 1.0
     c: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("Kp", "Ti", "Td", "Tf", "b", "c"):
+            value = getattr(self, name)
+            if type(value) is not float and (isinstance(value, bool) or not isinstance(value, Real)):
+                raise TypeError(f"{name} must be a number, not {value!r}")
 
 
 @dataclass(frozen=True, slots=True)

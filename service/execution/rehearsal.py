@@ -19,7 +19,7 @@ from loopwright.plantsim.plant import LinearPlant, SimulatedProcess
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import RunResult, run
-from loopwright.service.inputs.model_json import parse_model
+from loopwright.service.inputs.model_json import named, parse_model
 from loopwright.service.inputs.plausible import (
     Finite,
     Gain,
@@ -192,6 +192,8 @@ class PlantFile(BaseModel):
     @classmethod
     def _any_form(cls, data: object) -> object:
         """Takes a model in any form, such as K, T_s, L_s, in place of num, den and dead_time_s."""
+        if isinstance(data, str):
+            data = named(data)
         if not isinstance(data, Mapping) or "num" in data or "den" in data:
             return data
         form = {name: value for name, value in data.items() if name not in cls.model_fields}
@@ -298,7 +300,7 @@ def _t95(file: PlantFile) -> float:
 
 
 def rehearse(
-    spec: Mapping[str, object],
+    spec: Mapping[str, object] | str,
     method: str = FAST,
     on_event: Callable[[Event], None] | None = None,
     on_samples: Callable[[list[Sample]], None] | None = None,
@@ -309,7 +311,7 @@ def rehearse(
 ) -> Rehearsal:
     """Runs preflight to verification on a model in memory.
 
-    spec: the fields of `PlantFile`. A spec that cannot be used is refused with the reason "bad_input".
+    spec: the fields of `PlantFile`, or a model as a text, K=2,T=10,L=3. One that cannot be used is refused with the reason "bad_input".
     method: "fast", "setpoint", "five-stage", or a rule of `tuning.rules.registry` in place of the fifth stage.
     model: the model to design for; fast then needs no relay.
     options: those of `tuning.fast.procedure.FastOptions`, or of `tuning.five_stage.procedure.Options`.

@@ -19,7 +19,7 @@ from pydantic import (
 
 from loopwright.service.errors import RemoteSetpoint
 from loopwright.service.inputs.config import DirectionName, ExcitationName, LoopConfig, PermittedTest
-from loopwright.service.inputs.model_json import ModelForm
+from loopwright.service.inputs.model_json import ModelForm, parse_model
 from loopwright.service.inputs.plausible import (
     Finite,
     Gain,
@@ -65,7 +65,8 @@ class BadLimits(ValueError):
 
 
 class PlantModel(BaseModel):
-    """A transfer function to rehearse on, in deviation variables. Coefficients are by falling powers of s."""
+    """A transfer function to rehearse on, in deviation variables. Coefficients are by falling powers of s. In place of
+    num, den and dead_time_s, K, T and L and the other forms of a model are taken, too."""
 
     model_config = STRICT
 
@@ -75,6 +76,22 @@ class PlantModel(BaseModel):
     noise_std: Size = Field(default=0.0, description="Standard deviation of the PV noise, PV units", examples=[0.0])
     seed: Whole = Field(default=1, ge=0, le=2**53, description="Seed of the noise", examples=[1])
     sample_time_s: Time | None = Field(default=None, description="Sampling period, s", examples=[0.1])
+
+    @model_validator(mode="before")
+    @classmethod
+    def _any_form(cls, data: object) -> object:
+        """Takes a model in any form, such as K, T, L, in place of num, den and dead_time_s."""
+        if isinstance(data, Mapping):
+            beside = {name: value for name, value in data.items() if name in ("noise_std", "seed", "sample_time_s")}
+            form: object = {name: value for name, value in data.items() if name not in beside}
+            if data.keys() <= {"num", "den", "dead_time_s", *beside}:
+                return data
+        elif isinstance(data, str):
+            form, beside = data, {}
+        else:
+            return data
+        model = parse_model(form)
+        return {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L, **beside}
 
     @model_validator(mode="after")
     def _plausible(self) -> Self:

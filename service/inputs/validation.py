@@ -79,6 +79,10 @@ _EXPECTED = {
     "dict_type": "a mapping of names to values", "model_type": "a mapping of names to values",
 }  # fmt: skip
 _LONGEST = 40
+_MEANT = dict.fromkeys(("tau", "lag", "time_constant", "tc"), "T") | dict.fromkeys(
+    ("theta", "dead_time", "deadtime", "delay", "td", "dead"), "L"
+)
+"""What models are called elsewhere."""
 
 
 def _shown(value: object) -> str:
@@ -93,6 +97,8 @@ def did_you_mean(given: str, known: Sequence[str]) -> str:
     """Returns the question whether the most similar of the known names was meant; nothing where none is similar."""
     if (with_unit := f"{given}_s") in known:
         return f"; did you mean {with_unit}?"
+    if (meant := _MEANT.get(given.lower().removesuffix("_s"))) is not None and f"{meant}_s" in known:
+        return f"; did you mean {meant}_s?"
     alike = {name.lower(): name for name in known}
     found = get_close_matches(given.lower(), alike, 1)
     return f"; did you mean {alike[found[0]]}?" if found else ""
