@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -33,6 +34,20 @@ class Gains:
     Tf: float = 0.0
     b: float = 1.0
     c: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("Kp", "Ti", "Td", "Tf", "b", "c"):
+            value = getattr(self, name)
+            if type(value) is not float and (isinstance(value, bool) or not isinstance(value, Real)):
+                raise TypeError(f"{name} must be a number, not {value!r}")
+
+    def __str__(self) -> str:
+        """The gains in words: Kp 0.83, Ti 10 s, b 0.8."""
+        times = [f"{name} {value:.6g} s" for name, value in (("Td", self.Td), ("Tf", self.Tf)) if value]
+        usual = (("b", self.b, 1.0), ("c", self.c, 0.0))
+        weights = [f"{name} {value:.6g}" for name, value, without in usual if value != without]
+        integral = f"Ti {self.Ti:.6g} s" if self.Ti else "no Ti"
+        return ", ".join([f"Kp {self.Kp:.6g}", integral, *times, *weights])
 
 
 @dataclass(frozen=True, slots=True)

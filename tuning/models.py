@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -52,9 +53,10 @@ class FOPDT:
         return np.asarray(self.K * np.exp(-self.L * s) / (self.T * s + 1.0))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class SOPDT:
-    """A plant of second order plus dead time, K*exp(-L*s)/(T^2 s^2 + 2*zeta*T*s + 1).
+    """A plant of second order plus dead time, K*exp(-L*s)/(T^2 s^2 + 2*zeta*T*s + 1), or with two real lags
+    K*exp(-L*s)/((T1*s + 1)(T2*s + 1)): SOPDT(K, T, zeta, L) or SOPDT(K=..., T1=..., T2=..., L=...).
 
     K: the gain, PV units per MV unit, either sign.
     T: the reciprocal of the natural frequency, s, positive.
@@ -67,7 +69,27 @@ class SOPDT:
     zeta: float
     L: float
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        K: float,
+        T: float | None = None,
+        zeta: float | None = None,
+        L: float | None = None,
+        *,
+        T1: float | None = None,
+        T2: float | None = None,
+    ) -> None:
+        if T1 is not None and T2 is not None and T is None and zeta is None:
+            if not (T1 > 0.0 and T2 > 0.0):
+                raise ValueError(f"time constants must be positive: T1={T1} s, T2={T2} s")
+            T = math.sqrt(T1 * T2)
+            zeta = (T1 + T2) / (2.0 * T)
+        elif T1 is not None or T2 is not None:
+            raise TypeError("SOPDT takes K, T, zeta, L or K, T1, T2, L")
+        if T is None or zeta is None or L is None:
+            raise TypeError("SOPDT takes K, T, zeta, L or K, T1, T2, L, all four of them")
+        for name, value in (("K", K), ("T", T), ("zeta", zeta), ("L", L)):
+            object.__setattr__(self, name, value)
         finite = bool(np.isfinite([self.K, self.T, self.zeta, self.L]).all())
         if not (finite and self.K != 0.0 and self.T > 0.0 and self.zeta > 0.0 and self.L >= 0.0):
             raise ValueError(f"not a model: K={self.K}, T={self.T} s, zeta={self.zeta}, L={self.L} s")
@@ -75,10 +97,7 @@ class SOPDT:
     @classmethod
     def of_time_constants(cls, K: float, T1: float, T2: float, L: float) -> SOPDT:
         """The model K*exp(-L*s)/((T1*s + 1)(T2*s + 1)) with positive time constants T1 and T2, s."""
-        if not (T1 > 0.0 and T2 > 0.0):
-            raise ValueError(f"time constants must be positive: T1={T1} s, T2={T2} s")
-        T = math.sqrt(T1 * T2)
-        return cls(K, T, (T1 + T2) / (2.0 * T), L)
+        return cls(K, L=L, T1=T1, T2=T2)
 
     @property
     def T1(self) -> float:
@@ -220,15 +239,31 @@ class LinearSystem(Protocol):
     def dt(self) -> Any: ...
 
 
-def as_model(system: Model | LinearSystem | tuple[ArrayLike, ArrayLike], dead_time_s: float = 0.0) -> Model:
+class WithModel(Protocol):
+    """What has been found with a model, such as the result of `identify`."""
+
+    @property
+    def model(self) -> Model: ...
+
+
+AnyModel = Model | LinearSystem | WithModel | tuple[ArrayLike, ArrayLike] | Mapping[str, Any]
+"""What `as_model` takes."""
+
+
+def as_model(system: AnyModel, dead_time_s: float = 0.0) -> Model:
     """The model of this library for a transfer function of another, which has no dead time of its own.
 
-    system: the transfer function; a model of this library is returned as it is. scipy's forms are accepted: numerator
-    and denominator as a pair, zeros and poles, a state space.
+    system: the transfer function; a model of this library is returned as it is, and so is that of a result of
+    `identify`. scipy's forms are accepted: numerator and denominator as a pair, zeros and poles, a state space; and a
+    model by the names of its quantities, with or without their unit: {"K": 2, "T_s": 10, "L_s": 3}.
     dead_time_s: the dead time of a system of another library, s.
     Raises TypeError for what is no model. Raises ValueError for more than one input or output, discrete time, a dead
     time given twice, and coefficients that make no model.
     """
+    if isinstance(system, Mapping):
+        system = _by_names(system)
+    elif isinstance(found := getattr(system, "model", None), Model):
+        system = found
     if isinstance(system, Model):
         if dead_time_s:
             raise ValueError(
@@ -239,6 +274,24 @@ def as_model(system: Model | LinearSystem | tuple[ArrayLike, ArrayLike], dead_ti
         num, den = (np.atleast_1d(np.asarray(each, dtype=float)).tolist() for each in system)
         return TransferFunction(tuple(num), tuple(den), dead_time_s)
     return _of_another_library(system, dead_time_s)
+
+
+def _by_names(given: Mapping[str, Any]) -> Model:
+    """The model whose quantities have these names; raises as `as_model`."""
+    named = {str(name).removesuffix("_s"): value for name, value in given.items()}
+    names, integrating = named.keys() - {"integrating"}, named.pop("integrating", False)
+    if integrating is True and {"K", "L"} <= names <= {"K", "L", "T"}:
+        return Integrating(**named)
+    if integrating is False and names == {"K", "T", "L"}:
+        return FOPDT(**named)
+    if integrating is False and names in ({"K", "T", "zeta", "L"}, {"K", "T1", "T2", "L"}):
+        return SOPDT(**named)
+    if integrating is False and {"num", "den"} <= names <= {"num", "den", "dead_time"}:
+        return TransferFunction(tuple(named["num"]), tuple(named["den"]), named.get("dead_time", 0.0))
+    raise TypeError(
+        f"{', '.join(map(str, given))}: no model has these quantities; give K, T, L; K, T1, T2, L; K, T, zeta, L; K, "
+        "L, integrating, and T where it has a lag; or num, den, dead_time_s"
+    )
 
 
 def _of_another_library(given: Any, dead_time_s: float) -> TransferFunction:

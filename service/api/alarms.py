@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Body, FastAPI, Path, Request
+from fastapi import Body, FastAPI, Path, Request, Response
 from fastapi.responses import JSONResponse
 
-from loopwright.service.alarms.alarm import Alarm, AlarmList
+from loopwright.service.alarms.alarm import Alarm
 from loopwright.service.alarms.watch import FRESH_S, AlarmWatch, NoSuchAlarm
 from loopwright.service.api import problems
-from loopwright.service.api.job_views import Decision
+from loopwright.service.api.job_views import Decision, signed_by
+from loopwright.service.api.paging import LINK, Limit, Position, page_of
 from loopwright.service.api.routes import add, new_router
 
 AlarmId = Annotated[str, Path(description="Id of the alarm", examples=["0f3ac2d9be11"])]
@@ -20,9 +21,11 @@ def install(app: FastAPI, watch: AlarmWatch) -> None:
     """Adds GET /alarms, GET /alarms/{id} and POST /alarms/{id}/sign-off."""
     router = new_router("alarms")
 
-    @router.get("/alarms", summary="What is abnormal now, the worst first")
-    def list_alarms() -> AlarmList:
-        return AlarmList(alarms=list(watch.look(FRESH_S)))
+    @router.get(
+        "/alarms", summary="What is abnormal now, the worst first", responses={**LINK, **problems.responses(422)}
+    )
+    def list_alarms(response: Response, limit: Limit = 1000, cursor: Position = None) -> list[Alarm]:
+        return list(page_of(response, "/alarms", watch.look(FRESH_S), limit, cursor))
 
     @router.get(
         "/alarms/{alarm_id}", summary="An alarm, also one that was signed off", responses=problems.responses(404)
@@ -36,7 +39,7 @@ def install(app: FastAPI, watch: AlarmWatch) -> None:
         responses=problems.responses(404, 409, 422),
     )
     def sign_off_alarm(alarm_id: AlarmId, decision: Annotated[Decision | None, Body()] = None) -> Alarm:
-        return watch.sign_off(alarm_id, (decision or Decision()).by)
+        return watch.sign_off(alarm_id, signed_by(decision))
 
     add(app, router)
 

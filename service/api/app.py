@@ -33,8 +33,9 @@ from loopwright.service.api import (
     webhooks,
 )
 from loopwright.service.api import live as live_api
-from loopwright.service.api.aborts import stopping
-from loopwright.service.api.bodies import JsonRoute
+from loopwright.service.api.aborts import BODY, SaidBy, stopping
+from loopwright.service.api.bodies import JsonRoute, signed_test
+from loopwright.service.api.event_views import StoredEventView, event_view
 from loopwright.service.api.events import event_stream, still_permitted
 from loopwright.service.api.gate.access_log import Access, count_failures_of
 from loopwright.service.api.gate.gate import Gate, Policy
@@ -54,8 +55,9 @@ from loopwright.service.api.job_views import (
     job_view,
     live_view,
     loop_view,
+    signed_by,
 )
-from loopwright.service.api.paging import LARGEST
+from loopwright.service.api.paging import LARGEST, LINK, Cursor, Limit, more
 from loopwright.service.api.routes import add, name_of
 from loopwright.service.api.samples import Reading, csv_text, json_text, parts
 from loopwright.service.api.watch_views import WatchView
@@ -63,7 +65,7 @@ from loopwright.service.api.web.compressed import takes_gzip
 from loopwright.service.api.web.pages import Pages
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import FastRetune, RetuneRequest
+from loopwright.service.inputs.request import RetuneRequest
 from loopwright.service.jobs.fleet import Fleet
 from loopwright.service.jobs.kept_figures import KeptFigures
 from loopwright.service.jobs.manager import Jobs
@@ -232,7 +234,7 @@ def create_app(
         responses=problems.responses(404, 409, 422),
     )
     def dismiss_loop(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> DismissedView:
-        found = jobs.aftercare.dismiss(tag, (decision or Decision()).by)
+        found = jobs.aftercare.dismiss(tag, signed_by(decision))
         return DismissedView(loop=tag, jobs=[f"/jobs/{job_id}" for job_id in found])
 
     @app.post(
@@ -241,11 +243,12 @@ def create_app(
         summary="Start a retune",
         status_code=202,
         responses=problems.responses(404, 409, 422, 503),
+        openapi_extra={"requestBody": {"required": True}},
     )
     def retune_loop(
         tag: Tag, request: Request, response: Response, options: Annotated[RetuneRequest | None, Body()] = None
     ) -> JobView:
-        row = jobs.start(tag, options or FastRetune())
+        row = jobs.start(tag, signed_test(options))
         response.headers["Location"] = str(request.url_for("get_job", job_id=row.id).path)
         return view(row)
 
@@ -260,8 +263,8 @@ def create_app(
         response_class=StreamingResponse,
         responses={
             200: {
-                "content": {"text/event-stream": {}},
-                "description": "Events: state, stage_started, stage_done, note, progress and interruptions of the job",
+                "content": {"text/event-stream": {"schema": {"$ref": "#/components/schemas/JobEventView"}}},
+                "description": "Events. The schema is that of the data of each; its kind is the event's name too",
             },
             204: {"description": "The job is over and the client has received every event; it should not reconnect"},
             **problems.responses(404, 422),
@@ -286,6 +289,21 @@ def create_app(
         permitted = still_permitted(keyring, policy.sessions, current.get())
         stream = event_stream(jobs, job_id, last_event_id, permitted, elsewhere, streams_over)
         return StreamingResponse(stream, media_type="text/event-stream", headers={"Cache-Control": "no-store"})
+
+    @app.get(
+        "/jobs/{job_id}/log",
+        tags=["jobs"],
+        summary="The stored events of a job, the first one first",
+        responses={**LINK, **problems.responses(404, 422)},
+    )
+    def list_job_events(
+        job_id: JobId, response: Response, limit: Limit = 200, cursor: Cursor = None
+    ) -> list[StoredEventView]:
+        jobs.store.get(job_id)
+        found = jobs.store.events(job_id, cursor or 0, limit + 1)
+        if len(found) > limit:
+            more(response, f"/jobs/{job_id}/log", found[limit - 1].seq, limit=limit)
+        return [event_view(each) for each in found[:limit]]
 
     @app.get(
         "/jobs/{job_id}/samples",
@@ -327,9 +345,10 @@ def create_app(
         summary="Stop a job; its loop is restored",
         status_code=202,
         responses=problems.responses(404, 409, 422),
+        openapi_extra=BODY,
     )
-    def abort_job(job_id: JobId, decision: Annotated[Decision | None, Body()] = None) -> JobView:
-        return view(jobs.abort(job_id, (decision or Decision()).by))
+    def abort_job(job_id: JobId, by: SaidBy) -> JobView:
+        return view(jobs.abort(job_id, by))
 
     not_yet: problems.Responses = {
         202: {
@@ -356,7 +375,7 @@ def create_app(
         job_id: JobId, response: Response, decision: Annotated[AcceptDecision | None, Body()] = None
     ) -> JobView:
         given = decision or AcceptDecision()
-        row = jobs.decisions.accept(job_id, given.by, given.roll_back_by_itself)
+        row = jobs.decisions.accept(job_id, signed_by(given), given.roll_back_by_itself)
         return decided(row, JobState.ACCEPTED, response)
 
     @app.post(
@@ -368,7 +387,7 @@ def create_app(
     def roll_back_job(
         job_id: JobId, response: Response, decision: Annotated[Decision | None, Body()] = None
     ) -> JobView:
-        row = jobs.decisions.rollback(job_id, (decision or Decision()).by)
+        row = jobs.decisions.rollback(job_id, signed_by(decision))
         return decided(row, JobState.ROLLED_BACK, response)
 
     app.mount("/ui", Pages(), name="page")

@@ -1,5 +1,5 @@
 """Routes whose request body must be strict JSON (see `service.api.strict_json`) with a JSON content type, and whose
-query parameters must be known."""
+query parameters must be known; and who signs the test that a body asks for."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from fastapi.routing import APIRoute
 
 from loopwright.service.api import strict_json
 from loopwright.service.api.parameters import parameters_of, refuse_others
+from loopwright.service.inputs.request import AnyRetune
+from loopwright.service.security.principal import current
 
 _SHORT = 16_384
 """Bytes. A longer body is parsed in a thread, because parsing it would block the event loop."""
@@ -22,6 +24,23 @@ class BadBody(HTTPException):
     def __init__(self, why: str, where: str = "") -> None:
         super().__init__(422, why)
         self.where = f"body.{where}" if where else "body"
+
+
+def signed_test(options: AnyRetune | None) -> AnyRetune:
+    """The options of a retune, which is not begun by a request without a body, nor, on the loop, for nobody. Raises
+    BadBody."""
+    if options is None:
+        raise BadBody(
+            'a retune needs a body: send Content-Type: application/json and {"requested_by": "YOUR NAME"}, with the '
+            'options if there are any; {"dry_run": true} rehearses it and needs no name'
+        )
+    named = bool((options.requested_by or "").strip())
+    if not named and not options.dry_run and current.get().key_id is None:
+        raise BadBody(
+            'a test of the loop is signed by a person, and no key names the caller: add "requested_by": "YOUR NAME"',
+            "requested_by",
+        )
+    return options
 
 
 class JsonRoute(APIRoute):

@@ -1,23 +1,23 @@
 """The events of a job as server-sent events.
 
 The id of an event is its number in the job, so a client that was disconnected resumes with Last-Event-ID and misses
-nothing. `progress` events have no id, because they are not stored. The key of a stream is checked again while the
-stream is open; a revoked or expired key ends the stream.
+nothing. A `progress` event is not stored, and has the id of the latest event that is. The key of a stream is checked
+again while the stream is open; a revoked or expired key ends the stream.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
 import time
 from collections.abc import AsyncIterator, Callable
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from loopwright.service.api.event_views import ProgressEvent, Stored, event_view, progress_view
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.live.messages import RETRY_MS
-from loopwright.service.live.snapshot import JobProgress
+from loopwright.service.live.snapshot import JobProgress, progress_of
 from loopwright.service.security.principal import Principal
 from loopwright.service.security.sessions import BrowserSessions
 from loopwright.service.states.job_state import ACTIVE, JobState
@@ -56,7 +56,7 @@ async def event_stream(
     over: whether the service ends its streams; whoever resumes the stream at the next start misses nothing.
     """
     yield f"retry: {RETRY_MS}\n\n"
-    sent = ""
+    sent: JobProgress | None = None
     silent = 0
     asked = time.monotonic()
     while not over():
@@ -79,16 +79,16 @@ async def event_stream(
         ended = JobState(row.state) not in ACTIVE and not more
         for event in events:
             after, silent = event.seq, 0
-            data = {"at": event.at, "plant_time_s": event.plant_time_s, **event.data}
-            yield f"id: {event.seq}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"
+            yield _said(event_view(event).root)
         if ended:
             return
         if more:
             continue
-        progress = _progress(jobs, job_id) or await _progress_elsewhere(row, elsewhere)
-        if progress and progress != sent:
+        running = jobs.running(job_id)
+        progress = await _progress_elsewhere(row, elsewhere) if running is None else progress_of(running)
+        if progress is not None and progress != sent:
             sent, silent = progress, 0
-            yield f"event: progress\ndata: {progress}\n\n"
+            yield _said(progress_view(progress, after))
         silent += 1
         if silent % _KEEP_ALIVE_POLLS == 0:
             yield ": alive\n\n"
@@ -96,30 +96,12 @@ async def event_stream(
     yield ": the service ends, and the job has not ended yet\n\n"
 
 
-def _progress(jobs: Jobs, job_id: str) -> str:
-    running = jobs.running(job_id)
-    if running is None:
-        return ""
-    live = running.progress_now()
-    return _said(live.stage, live.fraction, live.remaining_s, live.plant_time_s)
-
-
-async def _progress_elsewhere(row: Job, elsewhere: Callable[[Job], JobProgress | None]) -> str:
+async def _progress_elsewhere(row: Job, elsewhere: Callable[[Job], JobProgress | None]) -> JobProgress | None:
     try:
-        found = await asyncio.to_thread(elsewhere, row)
+        return await asyncio.to_thread(elsewhere, row)
     except SQLAlchemyError:  # the next look says that the database does not answer
-        return ""
-    if found is None:
-        return ""
-    return _said(found.stage, found.progress, found.remaining_plant_time_s, found.plant_time_s)
+        return None
 
 
-def _said(stage: str | None, progress: float, remaining_s: float | None, plant_time_s: float) -> str:
-    return json.dumps(
-        {
-            "stage": stage,
-            "progress": round(progress, 4),
-            "remaining_plant_time_s": None if remaining_s is None else round(remaining_s, 3),
-            "plant_time_s": round(plant_time_s, 3),
-        }
-    )
+def _said(event: Stored | ProgressEvent) -> str:
+    return f"id: {event.id}\nevent: {event.kind}\ndata: {event.model_dump_json(by_alias=True)}\n\n"

@@ -11,7 +11,9 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 
 from loopwright.service.api import problems
-from loopwright.service.api.job_views import Decision, JobView, LoopView, loop_view
+from loopwright.service.api.aborts import BODY, SaidBy
+from loopwright.service.api.bodies import signed_test
+from loopwright.service.api.job_views import JobView, LoopView, loop_view
 from loopwright.service.api.paging import LINK, Cursor, JobLimit, Limit, listed, more
 from loopwright.service.api.routes import add, new_router
 from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest
@@ -175,6 +177,7 @@ def install(
         responses=problems.responses(422, 503),
     )
     def retune_loops(request: Request, response: Response, body: Annotated[FleetRequest, Body()]) -> RetuneView:
+        signed_test(body)
         row = fleet.start(body)
         response.headers["Location"] = str(request.url_for("get_retune", retune_id=row.id).path)
         return _view(*fleet.get(row.id))
@@ -206,9 +209,10 @@ def install(
         summary="Stop a retune of many loops: no more loops are begun, running jobs stop, and their loops are restored",
         status_code=202,
         responses=problems.responses(404, 409, 422),
+        openapi_extra=BODY,
     )
-    def abort_retune(retune_id: RetuneId, decision: Annotated[Decision | None, Body()] = None) -> RetuneView:
-        fleet.abort(retune_id, (decision or Decision()).by)
+    def abort_retune(retune_id: RetuneId, by: SaidBy) -> RetuneView:
+        fleet.abort(retune_id, by)
         return _view(*fleet.get(retune_id))
 
     add(app, router)

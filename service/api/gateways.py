@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from datetime import UTC, datetime
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Response
 from pydantic import BaseModel, Field
 
 from loopwright.service.api import problems
 from loopwright.service.api.job_views import LastHeardView, LiveErrorView, LiveView
+from loopwright.service.api.paging import LINK, Limit, Position, page_of
 from loopwright.service.api.routes import new_router
 from loopwright.service.errors import GatewayLost
 from loopwright.service.inputs.config import LoopConfig
@@ -60,14 +61,15 @@ def router(directory: LoopDirectory, own: OwnGateway, others: OtherGateways) -> 
     @routes.get(
         "/gateways",
         summary="The gateways that share the database, sorted by name",
-        responses=problems.responses(503),
+        responses={**LINK, **problems.responses(422, 503)},
     )
-    def list_gateways() -> list[GatewayView]:
+    def list_gateways(response: Response, limit: Limit = 1000, cursor: Position = None) -> list[GatewayView]:
         others.look()
         loops = Counter(host for _, host in directory.everywhere())
         found = [_here(own, loops[own.name])]
         found += [_other(name, loops[name], others) for name in {*loops, *others.every()} - {own.name}]
-        return sorted(found, key=lambda each: each.name)
+        found.sort(key=lambda each: each.name)
+        return list(page_of(response, "/gateways", found, limit, cursor))
 
     return routes
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from loopwright.service.api.watch_views import WatchView
 from loopwright.service.inputs.config import Limits, LoopConfig, PermittedTest
@@ -28,6 +28,7 @@ from loopwright.service.results import (
     VerificationView,
     empty_result,
 )
+from loopwright.service.security.principal import signed
 from loopwright.service.states.acceptance_watch import AcceptanceWatch
 from loopwright.service.states.job_state import ACTIVE, JobState, shown
 from loopwright.service.states.loop_state import LoopState, gains_of, same_gains
@@ -278,11 +279,51 @@ class StoppingView(BaseModel):
     at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
 
 
+class JobLinks(BaseModel):
+    """Where to find what belongs to a job, and what may be done about it now."""
+
+    loop: str = Field(examples=["/loops/TIC-101"])
+    events: str = Field(description="Its events, as they happen", examples=["/jobs/4f0c2a9be113/events"])
+    log: str = Field(description="Its events so far, as a list", examples=["/jobs/4f0c2a9be113/log"])
+    samples: str = Field(examples=["/jobs/4f0c2a9be113/samples"])
+    record: str | None = Field(description="The record with the model; null: there is none")
+    report: str | None = Field(description="The report, as HTML; null: the job is not over")
+    alternatives: str | None = Field(description="Gains by other methods; null: there is no model")
+    designs: str | None = Field(description="Gains from robust to fast; null: there is no model")
+    accept: str | None = Field(description="POST here accepts the proposal; null: there is none to accept")
+    rollback: str | None = Field(
+        description="POST here declines the proposal, or puts the old gains back; null: there is nothing to put back"
+    )
+    abort: str | None = Field(description="POST here stops the job; null: it is over")
+
+    @classmethod
+    def of(cls, row: Job, state: JobState, has_model: bool, has_record: bool) -> JobLinks:
+        here, over = f"/jobs/{row.id}", state not in ACTIVE
+
+        def when(permitted: bool, what: str) -> str | None:
+            return f"{here}/{what}" if permitted else None
+
+        return cls(
+            loop=f"/loops/{row.loop}",
+            events=f"{here}/events",
+            log=f"{here}/log",
+            samples=f"{here}/samples",
+            record=when(has_record, "record"),
+            report=when(over, "report"),
+            alternatives=when(over and has_model, "alternatives"),
+            designs=when(over and has_model, "designs"),
+            accept=when(state is JobState.PROPOSED, "accept"),
+            rollback=when(state in (JobState.PROPOSED, JobState.ACCEPTED), "rollback"),
+            abort=when(not over, "abort"),
+        )
+
+
 class JobView(BaseModel):
     """A job: its request, its progress and its result."""
 
     id: str = Field(examples=["4f0c2a9be113"])
     url: str = Field(examples=["/jobs/4f0c2a9be113"])
+    links: JobLinks
     loop: str = Field(examples=["TIC-101"])
     state: JobState = Field(
         description="State of the job. no_gain: the loop is already tuned as well as requested, which is a success; "
@@ -308,6 +349,10 @@ class JobView(BaseModel):
         examples=[0.42],
     )
     remaining_plant_time_s: float | None = Field(description="Expected plant time to the end, s", examples=[310.0])
+    remaining_wall_time_s: float | None = Field(
+        description="The same in wall time, s, at the pace that the plant had so far in this attempt; null: not known",
+        examples=[310.0],
+    )
     plant_time_s: float = Field(description="Plant time so far, s", examples=[224.0])
     stages: list[StageView]
     method: str = Field(description="Method that computes the gains", examples=["fast"])
@@ -398,7 +443,11 @@ class SamplesView(BaseModel):
 class Decision(BaseModel):
     """The person who decides, for the audit trail."""
 
-    by: str = Field(default="api", max_length=100, examples=["operator A"])
+    model_config = ConfigDict(strict=True)
+
+    by: str | None = Field(
+        default=None, max_length=100, description="The default is the name of the key", examples=["operator A"]
+    )
 
 
 class AcceptDecision(Decision):
@@ -409,6 +458,11 @@ class AcceptDecision(Decision):
         description="Put the old gains back by itself if, while the loop is watched, PV leaves its limits or an "
         "oscillation near the crossover grows over three periods, and nobody has changed gains or mode since",
     )
+
+
+def signed_by(decision: Decision | None) -> str:
+    """The name under which a decision is noted."""
+    return signed(None if decision is None else decision.by)
 
 
 def loop_view(
@@ -470,11 +524,13 @@ def job_view(
     state = shown(row.state, row.dry_run)
     later = latest is not None and latest.id != row.id and state is JobState.PROPOSED
     method = str(row.request.get("method", FIVE_STAGE))
+    kept = _record(state, events, has_record)
     result = row.result or empty_result(method)
-    progress, remaining, plant_time = _progress(state, row, events, running, elsewhere)
+    progress, remaining, wall, plant_time = _progress(state, row, events, running, elsewhere)
     return JobView(
         id=row.id,
         url=f"/jobs/{row.id}",
+        links=JobLinks.of(row, state, result.model is not None, kept == "kept"),
         loop=row.loop,
         state=state,
         dry_run=row.dry_run,
@@ -488,6 +544,7 @@ def job_view(
         stage=elsewhere.stage if elsewhere is not None and elsewhere.stage is not None else row.stage,
         progress=progress,
         remaining_plant_time_s=remaining,
+        remaining_wall_time_s=wall,
         plant_time_s=plant_time,
         stages=_stages(events, row),
         method=method,
@@ -518,28 +575,30 @@ def job_view(
         stopping=next((_stopping(event) for event in reversed(events) if event.kind == "abort_requested"), None),
         sample_time_s=None if row.found is None else number(row.found["sample_time_s"]),
         mode_found=None if row.found is None else str(row.found["mode"]),
-        record=_record(state, events, has_record),
+        record=kept,
     )
 
 
 def _progress(
     state: JobState, row: Job, events: Sequence[JobEvent], running: Running | None, elsewhere: JobProgress | None
-) -> tuple[float, float | None, float]:
-    """Fraction, remaining and present plant time. For a job of a gateway that says nothing they are those at its last
-    stage start."""
+) -> tuple[float, float | None, float | None, float]:
+    """Fraction, remaining plant and wall time, and present plant time. For a job of a gateway that says nothing they
+    are those at its last stage start."""
     if running is not None:
-        live = running.progress_now()
-        return live.fraction, live.remaining_s, live.plant_time_s
+        live, pace = running.progress_now(), running.pace()
+        left = live.remaining_s
+        return live.fraction, left, None if left is None or pace is None else left / pace, live.plant_time_s
     if state not in ACTIVE:
-        return 1.0, 0.0, row.plant_time_s
+        return 1.0, 0.0, 0.0, row.plant_time_s
     if elsewhere is not None:
-        return elsewhere.progress, elsewhere.remaining_plant_time_s, elsewhere.plant_time_s
+        far = elsewhere
+        return far.progress, far.remaining_plant_time_s, far.remaining_wall_time_s, far.plant_time_s
     begun = next((begun for event in reversed(events) if (begun := event.stage_begun())), None)
     if begun is None:
-        return 0.0, None, row.plant_time_s
+        return 0.0, None, None, row.plant_time_s
     remaining = begun.expected_s + begun.remaining_s
     total = row.plant_time_s + remaining
-    return (min(0.99, row.plant_time_s / total) if total > 0 else 0.0), remaining, row.plant_time_s
+    return (min(0.99, row.plant_time_s / total) if total > 0 else 0.0), remaining, None, row.plant_time_s
 
 
 def _stages(events: Sequence[JobEvent], row: Job) -> list[StageView]:

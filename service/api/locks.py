@@ -5,29 +5,30 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Path
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from loopwright.service.api import problems
-from loopwright.service.api.job_views import Decision, LockView
+from loopwright.service.api.job_views import Decision, LockView, signed_by
 from loopwright.service.api.routes import new_router
+from loopwright.service.inputs.validation import ONE_LINE, STRICT
 from loopwright.service.jobs.locking import Locking
+from loopwright.service.security.principal import signed
 
-_ONE_LINE = r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$"
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 
 
 class LockWish(BaseModel):
     """The reason for a lock, and the person who locks the loop."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = STRICT
 
-    by: str = Field(
-        default="api", max_length=100, pattern=_ONE_LINE,
-        description="Who locks the loop; shown to users whose requests are refused",
+    by: str | None = Field(
+        default=None, max_length=100, pattern=ONE_LINE,
+        description="Who locks the loop; shown to users whose requests are refused. The default is the name of the key",
         examples=["night shift"],
     )  # fmt: skip
     reason: str = Field(
-        min_length=1, max_length=200, pattern=_ONE_LINE, description="One line of text",
+        min_length=1, max_length=200, pattern=ONE_LINE, description="One line of text",
         examples=["valve is being overhauled"],
     )  # fmt: skip
 
@@ -61,7 +62,7 @@ def router(locking: Locking) -> APIRouter:
         responses=problems.responses(404, 409, 422),
     )
     def lock_loop(tag: Tag, asked: Annotated[LockWish, Body()]) -> LockedView:
-        row, running = locking.lock(tag, asked.reason, asked.by)
+        row, running = locking.lock(tag, asked.reason, signed(asked.by))
         url = note = None
         if running is not None:
             url = f"/jobs/{running.id}"
@@ -75,7 +76,7 @@ def router(locking: Locking) -> APIRouter:
         responses=problems.responses(404, 422),
     )
     def unlock_loop(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> UnlockedView:
-        row = locking.unlock(tag, (decision or Decision()).by)
+        row = locking.unlock(tag, signed_by(decision))
         return UnlockedView(loop=tag, was_locked=None if row is None else LockView.of(row))
 
     return routes

@@ -8,6 +8,7 @@ from typing import Any
 from fastapi import FastAPI
 
 from loopwright.service.api import problems
+from loopwright.service.api.event_views import schemas as event_schemas
 from loopwright.service.api.gate.gate import ALWAYS, scope_for
 from loopwright.service.api.idempotency import HEADER, MAX_CHARACTERS, PATTERN
 from loopwright.service.api.openapi_document import Document, HeaderField, Operation, Parameter, as_document
@@ -71,7 +72,7 @@ def _complete(document: Document) -> None:
             "machine needs no key, unless it was started with --auth.",
         }
     }
-    schemas["schemas"] = problems.schemas() | schemas["schemas"]
+    schemas["schemas"] = problems.schemas() | event_schemas() | schemas["schemas"]
     for never_answered in ("HTTPValidationError", "ValidationError"):
         schemas["schemas"].pop(never_answered, None)
     for path, item in document["paths"].items():

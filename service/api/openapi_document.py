@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from typing import Any, TypedDict, cast
 
+from fastapi.encoders import jsonable_encoder
+from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
+
 Schema = TypedDict(
     "Schema",
     {
@@ -87,3 +91,10 @@ class Document(TypedDict, total=False):
 def as_document(generated: dict[str, Any]) -> Document:
     """The document that FastAPI generates, which FastAPI types as a dictionary."""
     return cast("Document", generated)
+
+
+def schemas_of(model: type[BaseModel]) -> dict[str, Schema]:
+    """The schemas of a model and of its parts by name, for the components of a document."""
+    _, found = models_json_schema([(model, "serialization")], ref_template="#/components/schemas/{model}")
+    made: dict[str, Schema] = jsonable_encoder(found["$defs"], exclude_none=True)  # as FastAPI encodes the document
+    return made

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
 from typing import Annotated
-from urllib.parse import urlencode
 
 from fastapi import FastAPI, Query, Response
 from fastapi.responses import HTMLResponse, JSONResponse
@@ -19,7 +18,7 @@ from loopwright.service.alarms.watch import AlarmWatch
 from loopwright.service.api import metrics, problems
 from loopwright.service.api.docs_page import POLICY, page
 from loopwright.service.api.openapi_document import as_document
-from loopwright.service.api.paging import LARGEST
+from loopwright.service.api.paging import LINK, Cursor, Limit, more
 from loopwright.service.api.routes import add, new_router
 from loopwright.service.jobs.aftercare import NotHome
 from loopwright.service.jobs.manager import Jobs
@@ -90,13 +89,6 @@ class AuditView(BaseModel):
     loop: str | None = Field(examples=["TIC-101"])
     before: Mapping[str, object] | None = Field(description="State and gains before the change; null: there were none")
     after: Mapping[str, object] | None = Field(description="State and gains after the change; for a retune the request")
-
-
-class AuditPage(BaseModel):
-    entries: list[AuditView] = Field(description="The latest change first")
-    next: str | None = Field(
-        description="URL of the next page; null: this is the last one", examples=["/audit?before=17"]
-    )
 
 
 class Readiness:
@@ -193,22 +185,20 @@ def install(
     def get_metrics() -> Response:
         return Response(metrics.exposition(counted), media_type=metrics.MEDIA_TYPE)
 
-    @router.get("/audit", summary="The audit trail, latest change first", responses=problems.responses(422))
+    @router.get(
+        "/audit", summary="The audit trail, latest change first", responses={**LINK, **problems.responses(422)}
+    )
     def list_changes(
-        limit: Annotated[int, Query(ge=1, le=1000, description="Maximum number of changes")] = 100,
-        before: Annotated[
-            int | None, Query(ge=1, le=LARGEST, description="Only changes with a smaller number", examples=[17])
-        ] = None,
+        response: Response,
+        limit: Limit = 100,
+        cursor: Cursor = None,
         what: Annotated[str | None, Query(description="Only this kind of change", examples=["accept"])] = None,
         loop: Annotated[str | None, Query(description="Only changes of this loop", examples=["TIC-101"])] = None,
-    ) -> AuditPage:
-        rows = audit.trail(jobs.store.engine, limit + 1, before, None if what is None else [what], loop)
-        page_of = rows[:limit]
-        more = None
+    ) -> list[AuditView]:
+        rows = audit.trail(jobs.store.engine, limit + 1, cursor, None if what is None else [what], loop)
         if len(rows) > limit:
-            query = {"limit": limit, "before": page_of[-1].number, "what": what, "loop": loop}
-            more = f"/audit?{urlencode({k: v for k, v in query.items() if v is not None})}"
-        return AuditPage(entries=[_view(row) for row in page_of], next=more)
+            more(response, "/audit", rows[limit - 1].number, what=what, loop=loop, limit=limit)
+        return [_view(row) for row in rows[:limit]]
 
     add(app, router)
 

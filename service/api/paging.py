@@ -3,8 +3,8 @@ there is one (RFC 8288, rel="next")."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Annotated
+from collections.abc import Iterable, Sequence
+from typing import Annotated, TypeVar
 from urllib.parse import urlencode
 
 from fastapi import Query, Response
@@ -36,6 +36,23 @@ def more(response: Response, path: str, cursor: object, **query: object) -> None
     """Sets the Link header. query: the other parameters of the request; None for one that was not given."""
     given = {name: value for name, value in {**query, "cursor": cursor}.items() if value is not None}
     response.headers["Link"] = f'<{path}?{urlencode(given)}>; rel="next"'
+
+
+Position = Annotated[
+    int | None, Query(ge=1, le=LARGEST, description="Cursor from the URL of the next page, unchanged", examples=[100])
+]
+"""The cursor of a list that is no longer than what it lists now: how many entries come before the page."""
+Entry = TypeVar("Entry")
+
+
+def page_of(
+    response: Response, path: str, entries: Sequence[Entry], limit: int, position: int | None, **query: object
+) -> Sequence[Entry]:
+    """Returns the page of these entries that begins at a position, and sets the Link header."""
+    begin = position or 0
+    if len(entries) > begin + limit:
+        more(response, path, begin + limit, **query, limit=limit)
+    return entries[begin : begin + limit]
 
 
 def listed(response: Response, views: Iterable[BaseModel]) -> Response:

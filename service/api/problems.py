@@ -8,16 +8,14 @@ from http import HTTPStatus
 from typing import Any
 
 from fastapi import FastAPI, Request, Response
-from fastapi.encoders import jsonable_encoder
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
-from pydantic.json_schema import models_json_schema
 from sqlalchemy.exc import DataError, SQLAlchemyError
 from starlette.exceptions import HTTPException
 
 from loopwright.service.api.bodies import BadBody
-from loopwright.service.api.openapi_document import DocumentedResponse, HeaderField, MediaType, Schema
+from loopwright.service.api.openapi_document import DocumentedResponse, HeaderField, MediaType, Schema, schemas_of
 from loopwright.service.api.parameters import UnknownParameter
 from loopwright.service.errors import Conflict, Locked, NotKnown, RemoteSetpoint, Stopping, UnknownLoop
 from loopwright.service.execution.computing.pool import NotWanted
@@ -260,9 +258,7 @@ def responses(*statuses: int) -> Responses:
 
 def schemas() -> dict[str, Schema]:
     """The schemas of a problem by name, for the components of an OpenAPI document."""
-    _, found = models_json_schema([(Problem, "serialization")], ref_template="#/components/schemas/{model}")
-    made: dict[str, Schema] = jsonable_encoder(found["$defs"], exclude_none=True)  # as FastAPI encodes the document
-    return made
+    return schemas_of(Problem)
 
 
 def documented(*statuses: int) -> dict[int, DocumentedResponse]:

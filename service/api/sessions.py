@@ -8,7 +8,7 @@ from importlib.metadata import version
 
 from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from sqlalchemy.exc import SQLAlchemyError
 
 from loopwright.service.api import problems
@@ -16,6 +16,7 @@ from loopwright.service.api.gate.cookies import cookie_name, from_elsewhere
 from loopwright.service.api.gate.key_checks import KeyChecks, TooOften
 from loopwright.service.api.gate.limits import Buckets, retry_after
 from loopwright.service.api.routes import new_router
+from loopwright.service.inputs.validation import STRICT
 from loopwright.service.security.keys import Scope, key_id_of
 from loopwright.service.security.principal import Principal, current
 from loopwright.service.security.sessions import LASTS_S, BrowserSessions
@@ -31,7 +32,7 @@ _UNKNOWN = "unknown"
 class SignInRequest(BaseModel):
     """The API key with which a browser signs in."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = STRICT
 
     key: str = Field(
         min_length=1, max_length=200, description="The API key. Only the answer's cookie is used afterwards",

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, Field
 
 from loopwright.service.curves import LoopCurves
 from loopwright.service.inputs.model_json import ModelForm, form_shown
+from loopwright.service.inputs.validation import STRICT
 from loopwright.service.results import GainsView
 from loopwright.tuning.reasons import Reason
 from loopwright.tuning.rules.design import MIN_GM, MAX_Ms
@@ -46,7 +47,7 @@ class MethodView(BaseModel):
 class TuningRequest(BaseModel):
     """A process model, and the method that tunes it."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = STRICT
 
     model: ModelForm = Field(
         description="Process model in one of five forms", examples=[{"K": 0.8, "T_s": 3.0, "L_s": 1.0}]

@@ -7,11 +7,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query, Request
+from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from loopwright.service.api import problems
 from loopwright.service.api.computed import computed
+from loopwright.service.api.paging import LINK, Limit, Position, page_of
 from loopwright.service.api.routes import new_router
 from loopwright.service.api.tuning_views import AlternativesView, MethodView, TuningRequest, TuningsView
 from loopwright.service.execution.computing.pool import Pool
@@ -30,9 +31,12 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
     """A router with GET /methods, POST /tunings and GET /jobs/{job_id}/alternatives. pool: computes the tunings."""
     routes = new_router()
 
-    @routes.get("/methods", tags=["tunings"], summary="The tuning methods")
-    def list_methods() -> list[MethodView]:
-        return [MethodView.model_validate(each) for each in tunings.methods_json()]
+    @routes.get(
+        "/methods", tags=["tunings"], summary="The tuning methods", responses={**LINK, **problems.responses(422)}
+    )
+    def list_methods(response: Response, limit: Limit = 1000, cursor: Position = None) -> list[MethodView]:
+        found = [MethodView.model_validate(each) for each in tunings.methods_json()]
+        return list(page_of(response, "/methods", found, limit, cursor))
 
     @routes.post(
         "/tunings",

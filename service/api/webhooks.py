@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import FastAPI, Header
+from fastapi import FastAPI, Header, Response
 from pydantic import BaseModel, Field
 
-from loopwright.service.api.paging import Limit
+from loopwright.service.api import problems
+from loopwright.service.api.paging import LINK, Cursor, Limit, more
 from loopwright.service.api.routes import add, new_router
 from loopwright.service.live.webhooks.messages import JobMessage
 from loopwright.service.store import webhook_deliveries
@@ -37,16 +38,21 @@ def install(app: FastAPI, store: Store) -> None:
     """Adds GET /webhooks/deliveries, and what the service itself calls to the document."""
     router = new_router(_TAG)
 
-    @router.get("/webhooks/deliveries", summary="The latest messages to webhooks, the latest first")
-    def list_webhook_deliveries(
-        limit: Limit = 50,
-    ) -> list[WebhookDelivery]:
+    @router.get(
+        "/webhooks/deliveries",
+        summary="The latest messages to webhooks, the latest first",
+        responses={**LINK, **problems.responses(422)},
+    )
+    def list_webhook_deliveries(response: Response, limit: Limit = 50, cursor: Cursor = None) -> list[WebhookDelivery]:
+        found = webhook_deliveries.latest(store, limit + 1, cursor)
+        if len(found) > limit:
+            more(response, "/webhooks/deliveries", found[limit - 1].number, limit=limit)
         return [
             WebhookDelivery(
                 id=each.id, webhook=each.hook, job=f"/jobs/{each.job_id}", at=each.at, state=each.state,
                 attempts=each.attempts, error=each.error,
             )
-            for each in webhook_deliveries.latest(store, limit)
+            for each in found[:limit]
         ]  # fmt: skip
 
     add(app, router)

@@ -26,7 +26,7 @@ def alarms(
     as_json: AsJson = False,
 ) -> None:
     """Show what is abnormal, the worst first, or sign an alarm off."""
-    from loopwright.service.alarms.alarm import Alarm, AlarmList
+    from loopwright.service.alarms.alarm import Alarm
 
     client = Client(url)
     if sign_off is not None:
@@ -42,7 +42,7 @@ def alarms(
     if as_json:
         print_json(answer)
         return
-    found = parsed(AlarmList, answer).alarms
+    found = parsed(list[Alarm], answer)
     if not found:
         print("Nothing is abnormal.")
         return

@@ -54,6 +54,23 @@ class NotSent(ApiError):
     status = 2
 
 
+class Wrong(ApiError):
+    """The service refuses what was given: a value, a name, or the key."""
+
+    status = 2
+
+
+class NotNow(ApiError):
+    """What was given is good, and the loop or the job does not permit it as it is."""
+
+    status = 3
+
+
+_REFUSALS: dict[int, type[ApiError]] = {
+    400: Wrong, 401: Wrong, 403: Wrong, 404: Wrong, 413: Wrong, 415: Wrong, 422: Wrong, 409: NotNow,
+}  # fmt: skip
+
+
 class ServiceAway(ApiError):
     """The service does not answer, or says that it cannot do so now."""
 
@@ -84,7 +101,7 @@ class Client:
         import httpx
 
         if not url.startswith(("http://", "https://")):
-            raise ApiError(f"--url takes the address of a service as http://HOST:PORT, or https, not {url!r}")
+            raise NotSent(f"--url takes the address of a service as http://HOST:PORT, or https, not {url!r}")
         self.url = url.rstrip("/")
         key = os.environ.get(KEY_VARIABLE, "")
         if not (key.isascii() and key.isprintable()):
@@ -292,7 +309,8 @@ class Client:
         if answer.status_code == 401:
             body["advice"] = f"Put an API key into the environment variable {KEY_VARIABLE}."
         lines = [body.get("detail") or body.get("title"), body.get("advice"), body.get("job")]
-        raise ApiError("\n".join(line for line in lines if line))
+        refused = _REFUSALS.get(answer.status_code, ApiError)
+        raise refused("\n".join(line for line in lines if line))
 
 
 def _given(query: Mapping[str, str | float | None]) -> dict[str, str | float]:

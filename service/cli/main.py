@@ -412,7 +412,7 @@ def _other_gains(
         die(f"job {found.job} is of loop {found.loop}, not of {loop}", 2)
     (each,) = found.methods
     if each.retune is None:
-        die(f"{each.title}: {each.detail or 'its gains are not robust enough to be tried'}. {each.advice or ''}", 1)
+        die(f"{each.title}: {each.detail or 'its gains are not robust enough to be tried'}. {each.advice or ''}", 3)
     return dict(each.retune)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import getpass
 import json
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -93,6 +94,25 @@ def read_json_object(path: Path) -> dict[str, object]:
     except UnicodeDecodeError as error:
         die(f"{path}: is not text in UTF-8: byte {error.start}", 2)
     return json_object(text, str(path))
+
+
+def model_object(given: str, source: str) -> dict[str, object]:
+    """Returns the model that a user has typed, as JSON or as K=2,T=10,L=3, or that is in a file; ends the command with
+    status 2 if there is none.
+
+    source: the name of what was typed in the error.
+    """
+    typed = given.lstrip().startswith(("{", "["))
+    if typed or os.path.exists(given) or "=" not in given:
+        return json_object(given, source) if typed else read_json_object(Path(given))
+    from loopwright.service.inputs.model_json import named
+
+    try:
+        found = named(given)
+    except ValueError as error:
+        die(f"{source}: {error}", 2)
+    assert isinstance(found, dict)
+    return found
 
 
 def json_object(text: str, source: str) -> dict[str, object]:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from pathlib import Path
 
-from loopwright.service.cli.output import die, json_object, read_json_object
+from loopwright.service.cli.output import die, model_object
 from loopwright.service.inputs.model_json import BadModel, parse_model
 
 OPERATING_POINT = ("mv", "pv")
@@ -36,12 +35,10 @@ def with_own_plants(arguments: Sequence[str]) -> list[str]:
 
 def _transfer_function(given: str) -> str:
     """Returns the model as a transfer function in JSON; the name of a plant of the catalogue as it is."""
-    if given.lstrip().startswith("{"):
-        source, data = _OPTION, json_object(given, _OPTION)
-    elif given.endswith(".json"):
-        source, data = given, read_json_object(Path(given))
-    else:
+    typed = given.lstrip().startswith("{") or "=" in given
+    if not typed and not given.endswith(".json"):
         return given
+    source, data = _OPTION if typed else given, model_object(given, _OPTION)
     point = {name: data.pop(name) for name in (*OPERATING_POINT, *MORE) if name in data}
     try:
         model = parse_model(data)

@@ -16,8 +16,8 @@ from loopwright.service.cli.output import (
     AskedSettling,
     AskedWeight,
     die,
+    model_object,
     print_json,
-    read_json_object,
 )
 from loopwright.service.cli.tuning import Plot, check_plot
 
@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 
 
 def rehearse(
-    plant_file: Annotated[Path, typer.Argument(metavar="PLANT.json", help="Plant file, see docs/offline.md.")],
+    plant_file: Annotated[
+        str,
+        typer.Argument(metavar="PLANT.json", help="Plant file, see docs/offline.md; or a model such as K=2,T=10,L=3."),
+    ],
     method: Annotated[str, typer.Option(help="fast, setpoint, five-stage, or one of `loopwright methods`.")] = "fast",
     ms: Annotated[float | None, typer.Option(help="Ms that is designed for: 1.2 robust .. 1.6 .. 2.0 fast.")] = None,
     derivative: Annotated[
@@ -57,7 +60,7 @@ def rehearse(
     from loopwright.tuning.plan import Event, Note, StageDone
     from loopwright.tuning.reasons import Reason
 
-    spec = read_json_object(plant_file)
+    spec = model_object(plant_file, "the plant")
 
     def show(event: Event) -> None:
         text = f"note: {event.text}" if isinstance(event, Note) else None

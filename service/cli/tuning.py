@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from loopwright.service.cli.output import AsJson, die, json_object, print_json, read_json_object
+from loopwright.service.cli.output import AsJson, die, model_object, print_json
 from loopwright.service.offline.controller_forms import EQUATIONS, ISA_IN_S, VENDORS, BadForm, ControllerForm, Faceplate
 
 _SHOWN = "How gains are shown"
@@ -34,7 +34,8 @@ def methods(as_json: AsJson = False) -> None:
 
 def tune(
     model: Annotated[
-        str, typer.Option(metavar="JSON|FILE", help='Model, such as {"K": 2, "T_s": 10, "L_s": 3}, or its file.')
+        str,
+        typer.Option(metavar="MODEL|FILE", help="Model, such as K=2,T=10,L=3, the same as JSON, or its file."),
     ],
     method: Annotated[str, typer.Option(metavar="NAME", help="A method of `loopwright methods`, or all.")] = "all",
     option: Annotated[
@@ -73,9 +74,7 @@ def tune(
     if as_json and faceplate != ISA_IN_S:
         die("--json has the gains in ISA and in parallel form; --form, --pv-span and --minutes are for the table", 2)
     try:
-        typed = model.lstrip().startswith(("{", "["))
-        given = json_object(model, "--model") if typed else read_json_object(Path(model))
-        plant = parse_model(given)
+        plant = parse_model(model_object(model, "--model"))
         found = tunings.tune_model(plant, method, dict(_option(text) for text in option or ()))
     except (BadModel, tunings.BadTuning) as error:
         die(str(error), 2)

@@ -19,7 +19,7 @@ from loopwright.plantsim.plant import LinearPlant, SimulatedProcess
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import RunResult, run
-from loopwright.service.inputs.model_json import parse_model
+from loopwright.service.inputs.model_json import named, parse_model
 from loopwright.service.inputs.plausible import (
     Finite,
     Gain,
@@ -192,6 +192,8 @@ class PlantFile(BaseModel):
     @classmethod
     def _any_form(cls, data: object) -> object:
         """Takes a model in any form, such as K, T_s, L_s, in place of num, den and dead_time_s."""
+        if isinstance(data, str):
+            data = named(data)
         if not isinstance(data, Mapping) or "num" in data or "den" in data:
             return data
         form = {name: value for name, value in data.items() if name not in cls.model_fields}
@@ -223,7 +225,7 @@ class Rehearsal:
 
     result: as far as it came.  ended: why there is no proposal, None where there is one.
     plant_time_s: the plant time of each stage, s.  stages: what each stage found.
-    plant: the plant as completed, None for one that cannot be used.
+    plant: the plant as completed, None for one that cannot be used, or is a process of one's own.
     """
 
     result: FastResult | FiveStageResult
@@ -298,7 +300,7 @@ def _t95(file: PlantFile) -> float:
 
 
 def rehearse(
-    spec: Mapping[str, object],
+    spec: Mapping[str, object] | str,
     method: str = FAST,
     on_event: Callable[[Event], None] | None = None,
     on_samples: Callable[[list[Sample]], None] | None = None,
@@ -309,7 +311,8 @@ def rehearse(
 ) -> Rehearsal:
     """Runs preflight to verification on a model in memory.
 
-    spec: the fields of `PlantFile`. A spec that cannot be used is refused with the reason "bad_input".
+    spec: the fields of `PlantFile`, or a model as a text, K=2,T=10,L=3. One that cannot be used is refused with the
+    reason "bad_input".
     method: "fast", "setpoint", "five-stage", or a rule of `tuning.rules.registry` in place of the fifth stage.
     model: the model to design for; fast then needs no relay.
     options: those of `tuning.fast.procedure.FastOptions`, or of `tuning.five_stage.procedure.Options`.
@@ -327,20 +330,86 @@ def rehearse(
     try:
         file = _complete(PlantFile.model_validate(spec))
         loop, facts = _loop(file, Mode.MANUAL if excitations == (Excitation.MANUAL,) else Mode.AUTOMATIC)
-        outcome: RunResult[Proposal] | RunResult[FastProposal]
         limits = _limits(facts, _reach(file))
         hear = on_samples or (lambda samples: None)
         asked = asked or _asked(method, model, options)
-        if isinstance(asked, DesignOptions):
-            plan = _designing(facts, asked, model, excitations)
-            outcome = run(plan, loop, limits=limits, on_event=listen, on_samples=hear)
-        else:
-            outcome = run(five_stage(facts, asked), loop, limits=limits, on_event=listen, on_samples=hear)
+        outcome = _carried_out(facts, asked, model, excitations, loop, limits, listen, hear)
     except ValidationError as error:
         return Rehearsal(empty_result(method), Refused(Reason.BAD_INPUT, lines(error)))
     except Ended as ended:
         return Rehearsal(empty_result(method), ended)
     return _rehearsal(file, method, outcome, results, anyway=asked.propose_anyway)
+
+
+class _OwnProcess:
+    """A process that is a function of its user, from MV over one sampling period to PV at its end."""
+
+    def __init__(self, step: Callable[[float], float], pv: float) -> None:
+        self._step = step
+        self.pv = pv
+
+    def step(self, mv: float) -> float:
+        self.pv = float(self._step(mv))
+        return self.pv
+
+
+def rehearse_process(
+    step: Callable[[float], float],
+    *,
+    pv: float,
+    mv: float,
+    sample_time_s: float,
+    t95_s: float,
+    sp_deviation: float,
+    gains: Gains,
+    reverse_acting: bool = True,
+    mv_limits: tuple[float, float] = (0.0, 100.0),
+    pv_limits: tuple[float, float] = (-math.inf, math.inf),
+    method: str = FAST,
+    **options: Any,
+) -> Rehearsal:
+    """Runs a procedure on a process of one's own, sample by sample in memory, from rest in automatic.
+
+    step: takes the MV of one sampling period, returns the PV at its end.
+    pv, mv: where it rests; pv is the set-point.  gains: those in effect.
+    sample_time_s, t95_s: s.  sp_deviation, pv_limits: PV units.  mv_limits: MV units.
+    reverse_acting: whether MV falls as PV rises, as it must where PV rises with MV.
+    method, options: as of `rehearse`.
+    """
+    results: dict[str, object] = {}
+
+    def listen(event: Event) -> None:
+        if isinstance(event, StageDone):
+            results[event.stage] = event.result
+
+    (low, high), (pv_low, pv_high), span = mv_limits, pv_limits, 1e9
+    settings = Settings(mv_low=low, mv_high=high, safe_output=mv, pv_low=-span, pv_high=span, reverse=reverse_acting)
+    channel = Channel(sample_time_s, settings, _parameters(gains), pv, int(Mode.AUTOMATIC), mv)
+    facts = Facts(sample_time_s, t95_s, low, high, sp_deviation, gains, reverse_acting)
+    limits = RunLimits(pv_low, pv_high, low, high, max_time_s=500 * t95_s, max_frozen_s=3 * t95_s)
+    loop = RehearsedLoop(_OwnProcess(step, pv), channel, sample_time_s)
+    try:
+        asked = _asked(method, None, options)
+        outcome = _carried_out(facts, asked, None, (Excitation.RELAY,), loop, limits, listen, lambda samples: None)
+    except Ended as ended:
+        return Rehearsal(empty_result(method), ended)
+    return _rehearsal(None, method, outcome, results, anyway=asked.propose_anyway)
+
+
+def _carried_out(
+    facts: Facts,
+    asked: DesignOptions | Options,
+    model: Model | None,
+    excitations: tuple[Excitation, ...],
+    loop: RehearsedLoop,
+    limits: RunLimits,
+    listen: Callable[[Event], None],
+    hear: Callable[[list[Sample]], None],
+) -> RunResult[Proposal] | RunResult[FastProposal]:
+    if isinstance(asked, DesignOptions):
+        plan = _designing(facts, asked, model, excitations)
+        return run(plan, loop, limits=limits, on_event=listen, on_samples=hear)
+    return run(five_stage(facts, asked), loop, limits=limits, on_event=listen, on_samples=hear)
 
 
 def _designing(
@@ -354,9 +423,9 @@ def _designing(
 def _asked(method: str, model: Model | None, options: dict[str, Any]) -> DesignOptions | Options:
     """Raises Refused."""
     if method == FAST:
-        return FastOptions(**options)
+        return FastOptions(**{"Ms" if name == "ms" else name: value for name, value in options.items()})
     if method == SETPOINT:
-        return DesignOptions(**options)
+        return DesignOptions(**{"Ms" if name == "ms" else name: value for name, value in options.items()})
     return Options(method=method, model=_entered(model), **options)
 
 
@@ -412,7 +481,7 @@ def _reach(file: PlantFile) -> float:
 
 
 def _rehearsal(
-    file: PlantFile,
+    file: PlantFile | None,
     method: str,
     outcome: RunResult[Proposal] | RunResult[FastProposal],
     results: dict[str, object],

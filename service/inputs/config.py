@@ -1,6 +1,7 @@
 """The file loops.yaml: the loops, their addresses on the bus, and the limits of a retune.
 
-All errors of a file are reported together, so that its author need not load it again for each mistake.
+All errors of a file are reported together, so that its author need not load it again for each mistake. A number in
+quotes is a number here: to YAML 1.1 `1e-3`, without a point, is a text. `yes`, `on` and `true` are none.
 """
 
 from __future__ import annotations
@@ -11,16 +12,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from loopwright.service.inputs.plausible import Positive, SetpointWeight, Size, Time, Value, check_step
+from loopwright.service.inputs.plausible import Positive, SetpointWeight, Size, Time, Value, check_step, not_bool
 from loopwright.service.inputs.validation import did_you_mean, listed, words
 from loopwright.service.inputs.webhooks import WebhookConfig, repeated_names
 
 if TYPE_CHECKING:
     from loopwright.service.inputs.yaml_file import Place
 
-Node = Annotated[int, Field(ge=1, le=127)]
+Whole = Annotated[int, BeforeValidator(not_bool)]
+Node = Annotated[Whole, Field(ge=1, le=127)]
 ExcitationName = Literal["observe", "setpoint", "relay", "manual"]
 DirectionName = Literal["both", "up", "down"]
 Tag = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
@@ -127,7 +129,7 @@ class LoopConfig(BaseModel):
     bus: str
     controller_node: Node
     plant_node: Node | None = None
-    channel: int = Field(default=1, ge=1, le=199)
+    channel: Whole = Field(default=1, ge=1, le=199)
     pv_unit: str = Field(min_length=1)
     mv_limits: Limits = Limits(low=0.0, high=100.0)
     pv_limits: Limits
@@ -169,7 +171,7 @@ class BusConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    at_once: int = Field(default=8, ge=1, le=1000)
+    at_once: Whole = Field(default=8, ge=1, le=1000)
     listen: bool = True
 
 

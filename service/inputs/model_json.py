@@ -5,6 +5,8 @@
 {"K": 2, "T_s": 6, "zeta": 0.5, "L_s": 3}                second order by its damping ratio; complex poles too
 {"K": 0.1, "L_s": 3, "integrating": true, "T_s": 5}      integrating; T_s, a lag, may be left out
 {"num": [2], "den": [10, 1], "dead_time_s": 3}           transfer function, highest power of s first
+
+The unit may be left out of the names, {"K": 2, "T": 10, "L": 3}, and so may the JSON of the first four: K=2,T=10,L=3.
 """
 
 from __future__ import annotations
@@ -16,7 +18,6 @@ from typing import Annotated, Literal, Self
 from pydantic import (
     BaseModel,
     BeforeValidator,
-    ConfigDict,
     Discriminator,
     Field,
     JsonValue,
@@ -27,7 +28,7 @@ from pydantic import (
 )
 
 from loopwright.service.inputs.plausible import MAX_TIME_S, MIN_TIME_S, Implausible, check_damping, check_model
-from loopwright.service.inputs.validation import branch, branch_of, did_you_mean, lines
+from loopwright.service.inputs.validation import STRICT, branch, branch_of, did_you_mean, lines
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 
 MAX_COEFFICIENTS = 12
@@ -39,6 +40,39 @@ _BESIDE = frozenset(
 
 class BadModel(ValueError):
     """The input is no valid model. The message names the quantity, its value, and what is accepted."""
+
+
+_WITH_UNIT = {"T": "T_s", "T1": "T1_s", "T2": "T2_s", "L": "L_s"}
+_TEXT = "such as K=2,T=10,L=3"
+
+
+def named(given: object) -> object:
+    """The object with the names that the forms have, of one whose names lack the unit, or of a text such as
+    K=2,T=10,L=3. Anything else is returned as it is. Raises ValueError for a text that is none."""
+    data = _of_text(given) if isinstance(given, str) else given
+    if not isinstance(data, Mapping):
+        return data
+    full = {"L": "dead_time_s", "L_s": "dead_time_s"} if "num" in data or "den" in data else _WITH_UNIT
+    return {name if full.get(name, name) in data else full.get(name, name): value for name, value in data.items()}
+
+
+def _of_text(text: str) -> dict[str, object]:
+    found: dict[str, object] = {}
+    for part in text.replace(";", ",").split(","):
+        name, equals, value = (each.strip() for each in part.partition("="))
+        if name == "integrating" and value in ("", "true"):
+            found[name] = True
+        elif not equals or not name:
+            raise ValueError(f"{_shown(text)} is no model: a text {_TEXT} is expected, or a JSON object; {accepted()}")
+        else:
+            try:
+                number = float(value)
+            except ValueError:
+                raise ValueError(f"{name} must be a finite number, not {_shown(value)}") from None
+            if name in found:
+                raise ValueError(f"{name} is given twice: leave one of them out")
+            found[name] = number
+    return found
 
 
 def finite(value: object, name: str) -> float:
@@ -126,7 +160,7 @@ Coefficients = Annotated[
 
 
 class _Form(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = STRICT
 
     def plant(self) -> Model:
         """The model as an object of `tuning`."""
@@ -271,13 +305,19 @@ ModelForm = Annotated[
     | Annotated[IntegratingModel, branch(IntegratingModel)]
     | Annotated[TransferFunctionModel, branch(TransferFunctionModel)],
     Discriminator(lambda data: branch_of(_form_of(data))),
+    BeforeValidator(named),
 ]
-"""A model as JSON, in one of the five forms."""
+"""A model as JSON, in one of the five forms, or as a text."""
 _ADAPTER: TypeAdapter[Form] = TypeAdapter(ModelForm)
 
 
 def parse_model(data: object) -> Model:
-    """The model that a JSON object or a plant file of `loopwright rehearse` describes. Raises BadModel."""
+    """The model that a JSON object, a text such as K=2,T=10,L=3 or a plant file of `loopwright rehearse` describes.
+    Raises BadModel."""
+    try:
+        data = named(data)
+    except ValueError as error:
+        raise BadModel(str(error)) from None
     if isinstance(data, Mapping) and {"num", "den"} <= data.keys():
         data = {name: value for name, value in data.items() if name not in _BESIDE}
     try:

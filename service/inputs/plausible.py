@@ -13,7 +13,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 MIN_TIME_S, MAX_TIME_S = 1e-6, 1e8
 """The range is from a microsecond, the unit of a controller's sampling period, to three years."""
@@ -174,10 +174,18 @@ def _within(low: float, high: float, unit: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-SetpointWeight = Annotated[float, Field(ge=0.0, le=2.0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+def not_bool(value: object) -> object:
+    """Raises ValueError for true and false, which Python would count as 1 and 0."""
+    if isinstance(value, bool):
+        raise ValueError(f"a number is expected, not {str(value).lower()}")
+    return value
+
+
+_Number = Annotated[float, BeforeValidator(not_bool)]
+SetpointWeight = Annotated[_Number, Field(ge=0.0, le=2.0, allow_inf_nan=False)]
+Finite = Annotated[_Number, Field(allow_inf_nan=False)]
+Positive = Annotated[_Number, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[_Number, Field(ge=0, allow_inf_nan=False)]
 Time = Annotated[Positive, _within(MIN_TIME_S, MAX_TIME_S, "s")]
 TimeOrNone = Annotated[NotNegative, _within(MIN_TIME_S, MAX_TIME_S, "s, or 0")]
 Gain = Annotated[Positive, _within(MIN_GAIN, MAX_GAIN, "PV and MV units over each other")]

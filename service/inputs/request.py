@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import (
     BaseModel,
     BeforeValidator,
-    ConfigDict,
     Discriminator,
     Field,
     JsonValue,
@@ -20,7 +19,7 @@ from pydantic import (
 
 from loopwright.service.errors import RemoteSetpoint
 from loopwright.service.inputs.config import DirectionName, ExcitationName, LoopConfig, PermittedTest
-from loopwright.service.inputs.model_json import ModelForm
+from loopwright.service.inputs.model_json import ModelForm, parse_model
 from loopwright.service.inputs.plausible import (
     Finite,
     Gain,
@@ -35,7 +34,7 @@ from loopwright.service.inputs.plausible import (
     check_option,
     check_step,
 )
-from loopwright.service.inputs.validation import branch, branch_of, did_you_mean
+from loopwright.service.inputs.validation import STRICT, Whole, branch, branch_of, did_you_mean
 from loopwright.tuning.experiments.primitives import Directions
 from loopwright.tuning.experiments.step_limits import not_kept
 from loopwright.tuning.fast.design import MAX_WEIGHT, Aim
@@ -67,16 +66,33 @@ class BadLimits(ValueError):
 
 
 class PlantModel(BaseModel):
-    """A transfer function to rehearse on, in deviation variables. Coefficients are by falling powers of s."""
+    """A transfer function to rehearse on, in deviation variables. Coefficients are by falling powers of s. In place of
+    num, den and dead_time_s, K, T and L and the other forms of a model are taken, too."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = STRICT
 
     num: list[Finite] = Field(min_length=1, max_length=12, description="Numerator", examples=[[3.0, 2.0]])
     den: list[Finite] = Field(min_length=1, max_length=12, description="Denominator", examples=[[3.0, 4.0, 1.0]])
     dead_time_s: NotNegative = Field(default=0.0, description="Dead time, s", examples=[1.0])
     noise_std: Size = Field(default=0.0, description="Standard deviation of the PV noise, PV units", examples=[0.0])
-    seed: int = Field(default=1, ge=0, le=2**53, description="Seed of the noise", examples=[1])
+    seed: Whole = Field(default=1, ge=0, le=2**53, description="Seed of the noise", examples=[1])
     sample_time_s: Time | None = Field(default=None, description="Sampling period, s", examples=[0.1])
+
+    @model_validator(mode="before")
+    @classmethod
+    def _any_form(cls, data: object) -> object:
+        """Takes a model in any form, such as K, T, L, in place of num, den and dead_time_s."""
+        if isinstance(data, Mapping):
+            beside = {name: value for name, value in data.items() if name in ("noise_std", "seed", "sample_time_s")}
+            form: object = {name: value for name, value in data.items() if name not in beside}
+            if data.keys() <= {"num", "den", "dead_time_s", *beside}:
+                return data
+        elif isinstance(data, str):
+            form, beside = data, {}
+        else:
+            return data
+        model = parse_model(form)
+        return {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L, **beside}
 
     @model_validator(mode="after")
     def _plausible(self) -> Self:
@@ -116,7 +132,7 @@ class Bounds(BaseModel):
 class _Retune(Bounds):
     """The options that every method has."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = STRICT
 
     model: ModelForm | None = Field(
         default=None,
@@ -135,10 +151,11 @@ class _Retune(Bounds):
         "the loop, else on a guess; the job shows which",
     )
     plant: PlantModel | None = Field(default=None, description="Plant to rehearse on, only with dry_run")
-    requested_by: str = Field(
-        default="api",
+    requested_by: str | None = Field(
+        default=None,
         max_length=100,
-        description="Name of the person who requests the retune",
+        description="Name of the person who requests the retune. The default is the name of the key; a test of the "
+        "loop needs it where no key names the caller",
         examples=["night shift"],
     )
 
@@ -196,6 +213,7 @@ class DesignRetune(_Retune):
     derivative: bool = Field(default=False, description="Design a PID where a derivative improves the loop")
     aim: Aim = Field(
         default=Aim.BALANCED,
+        strict=False,
         description="What the gains, with the set-point weight b, are the best for under the Ms asked for, by the "
         "integral of the error (IAE). balanced: set-point steps and load disturbances alike; setpoint: set-point steps "
         "nine times as much; load: load disturbances alone; no_overshoot: as balanced, and PV overshoots a set-point "
@@ -268,9 +286,8 @@ class FastRetune(DesignRetune):
         "what the MV limits permit, adapted after the first period",
         examples=[10.0],
     )
-    excitations: tuple[ExcitationName, ...] | None = Field(
+    excitations: Annotated[tuple[ExcitationName, ...], Field(strict=False, min_length=1)] | None = Field(
         default=None,
-        min_length=1,
         description="What moves the loop, among what loops.yaml permits (test: excitations); the default is all of "
         "that. observe: where normal operation has shown the plant well enough, only the new gains are tried; "
         "setpoint: pulses under the present gains, in automatic; relay: the controller's relay. Each follows only "
@@ -379,6 +396,7 @@ class FiveStages(_Retune):
     )
     overshoot_window_pct: tuple[Percent, Percent] = Field(
         default=(10.0, 50.0),
+        strict=False,
         description="Permitted overshoot of the PI step, percent: low, high; 0 < low < high < 74",
         examples=[[8.0, 50.0]],
         json_schema_extra={"items": {"type": "number"}},  # for readers of OpenAPI that know no prefixItems

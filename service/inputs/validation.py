@@ -4,9 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
+from typing import Annotated
 
-from pydantic import Tag, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Tag, ValidationError
 from pydantic_core import ErrorDetails
+
+STRICT = ConfigDict(extra="forbid", strict=True)
+"""Of what comes as JSON: a number is a number and not a text with digits, and true is no number. A list that is a tuple
+here, and a word of a closed list, are declared with strict=False."""
+ONE_LINE = r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$"
+"""A name or a reason: one line of text that is not blank."""
+
+
+def _whole(value: object) -> object:
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+Whole = Annotated[int, BeforeValidator(_whole)]
+"""A whole number of strict JSON, which knows no other kind of numbers: 3.0 is 3."""
 
 _BRANCH = "="
 """Prefix of the tag of a union's branch. The tag is part of an error's path, although the sender did not write it."""
@@ -64,6 +79,10 @@ _EXPECTED = {
     "dict_type": "a mapping of names to values", "model_type": "a mapping of names to values",
 }  # fmt: skip
 _LONGEST = 40
+_MEANT = dict.fromkeys(("tau", "lag", "time_constant", "tc"), "T") | dict.fromkeys(
+    ("theta", "dead_time", "deadtime", "delay", "td", "dead"), "L"
+)
+"""What models are called elsewhere."""
 
 
 def _shown(value: object) -> str:
@@ -78,6 +97,8 @@ def did_you_mean(given: str, known: Sequence[str]) -> str:
     """Returns the question whether the most similar of the known names was meant; nothing where none is similar."""
     if (with_unit := f"{given}_s") in known:
         return f"; did you mean {with_unit}?"
+    if (meant := _MEANT.get(given.lower().removesuffix("_s"))) is not None and f"{meant}_s" in known:
+        return f"; did you mean {meant}_s?"
     alike = {name.lower(): name for name in known}
     found = get_close_matches(given.lower(), alike, 1)
     return f"; did you mean {alike[found[0]]}?" if found else ""

@@ -18,6 +18,8 @@ from loopwright.tuning.reasons import Reason
 
 _BLOCK_SAMPLES = 4096
 _BLOCK_WALL_S = 1.0
+_PACE_WALL_S = 2.0
+"""Wall time after which the pace of a loop is known, s."""
 
 
 class Running:
@@ -54,6 +56,8 @@ class Running:
         self._stage = "preflight"
         self._boundaries: list[tuple[float, str]] = []
         self._last_t = -math.inf
+        self._first: tuple[float, float] | None = None
+        """Plant time and wall time of the first sample, s."""
         self._monotonic = monotonic
         self._flushed = monotonic()
 
@@ -100,11 +104,22 @@ class Running:
         """Returns the progress at the latest sample, without changing any state."""
         return self.progress.seen_at(self.loop.t_s if self.loop else None)
 
+    def pace(self) -> float | None:
+        """Returns how many seconds of plant time a second of wall time had in this attempt: 1 on a real plant. None
+        where it is not known yet, and of a rehearsal."""
+        t = self.loop.t_s if self.loop else None
+        if t is None or self._first is None:
+            return None
+        first_t, first_wall = self._first
+        wall = self._monotonic() - first_wall
+        return (t - first_t) / wall if wall >= _PACE_WALL_S and t > first_t else None
+
     def _keep_time(self) -> None:
         """Advances the progress to the latest sample."""
         t = self.loop.t_s if self.loop else None
         if t is not None:
             self._last_t = t
+            self._first = self._first or (t, self._monotonic())
             self.progress.at(t)
 
     def tell(self, kind: str, data: Mapping[str, object], stage: str | None = None) -> None:

@@ -31,9 +31,10 @@ from loopwright.service.inputs.request import (
     retune_request,
     within,
 )
-from loopwright.service.inputs.validation import branch, lines
+from loopwright.service.inputs.validation import Whole, branch, lines
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
+from loopwright.service.security.principal import signed
 from loopwright.service.states.job_state import IllegalMove
 from loopwright.service.store import retunes
 from loopwright.service.store.clock import now
@@ -49,7 +50,7 @@ log = logging.getLogger(__name__)
 POLL_S = 0.5
 """Wall time between two rounds, s."""
 _OWN = ("loops", "pattern", "at_once_per_bus", "at_once_per_area", "stop_after_failures")
-AtOnce = Annotated[int, Field(ge=1, le=1000)]
+AtOnce = Annotated[Whole, Field(ge=1, le=1000)]
 
 
 class _Loops(BaseModel):
@@ -192,11 +193,12 @@ class Fleet:
                 wrong.append(str(error) if tag not in known else f"{tag}: {error}")
         if wrong:
             raise BadFleet("; ".join(wrong))
-        asked = {name: value for name, value in request.asked().items() if name != "loops"}
+        by = signed(request.requested_by)
+        asked = {name: value for name, value in request.asked().items() if name != "loops"} | {"requested_by": by}
         row: RetuneRow | None = None
         try:
             with self._store.writing() as session:
-                row = retunes.add(session, self._store.host, asked, tags, request.requested_by)
+                row = retunes.add(session, self._store.host, asked, tags, by)
                 self._unanswered[row.id] = False
         except BaseException:
             if row is not None:

@@ -31,6 +31,7 @@ from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
 from loopwright.service.jobs.worker import Worker
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
+from loopwright.service.security.principal import signed
 from loopwright.service.states.job_state import ACTIVE, IllegalMove, JobState
 from loopwright.service.store.job_rows import NoSuchJob
 from loopwright.service.store.jobs import Job
@@ -196,7 +197,8 @@ class Jobs:
             made.append(Job.from_row(row))
 
         try:
-            row = self.store.create(tag, asked, request.requested_by, request.dry_run, host, WORKFLOW_VERSION, make)
+            by = signed(request.requested_by)
+            row = self.store.create(tag, asked, by, request.dry_run, host, WORKFLOW_VERSION, make)
             self.engine.enqueue(row.id, self._rehearsals(host) if row.dry_run else self._queue(config, host))
         except Exception:
             # The caller is told that the start failed, so the job must not begin later. It may be stored even where

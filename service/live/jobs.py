@@ -92,6 +92,7 @@ class LookedUpJobs:
             stage=job.stage if now is None or now.stage is None else now.stage,
             progress=None if now is None else now.progress,
             remaining_plant_time_s=None if now is None else now.remaining_plant_time_s,
+            remaining_wall_time_s=None if now is None else now.remaining_wall_time_s,
             plant_time_s=round(job.plant_time_s, 1) if now is None else now.plant_time_s,
             stopping=job.stopping or (now is not None and now.stopping),
         )
@@ -104,6 +105,6 @@ class LookedUpJobs:
 def _happening(loop: str, found: JobEvent) -> str:
     message = JobHappening(
         job=found.job_id, loop=loop, seq=found.seq, kind=found.kind, at=found.at, plant_time_s=found.plant_time_s,
-        data=found.data,
+        data=found.shown(),
     )  # fmt: skip
     return event("job", message, f"{found.job_id}.{found.seq}")

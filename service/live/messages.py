@@ -123,6 +123,7 @@ class LiveJob(BaseModel):
     stage: str | None
     progress: float | None = Field(description="Fraction of the expected plant time, 0 to 1")
     remaining_plant_time_s: float | None
+    remaining_wall_time_s: float | None
     plant_time_s: float
     stopping: bool = Field(description="Whether somebody has asked the job to stop")
 

@@ -14,24 +14,27 @@ from loopwright.service.states.loop_state import LoopState
 
 
 class JobProgress(BaseModel):
-    """How far a running job has come. Times are plant time, s."""
+    """How far a running job has come. Times are plant time unless they are called wall time, s."""
 
     id: str
     stage: str | None
     progress: float
     remaining_plant_time_s: float | None
+    remaining_wall_time_s: float | None = None
     plant_time_s: float
     stopping: bool
 
 
 def progress_of(running: Running) -> JobProgress:
     """Returns how far a job of this service has come."""
-    now = running.progress_now()
+    now, pace = running.progress_now(), running.pace()
+    remaining_s = now.remaining_s
     return JobProgress(
         id=running.job_id,
         stage=now.stage,
         progress=round(now.fraction, 4),
-        remaining_plant_time_s=None if now.remaining_s is None else round(now.remaining_s, 1),
+        remaining_plant_time_s=None if remaining_s is None else round(remaining_s, 1),
+        remaining_wall_time_s=None if remaining_s is None or pace is None else round(remaining_s / pace, 1),
         plant_time_s=round(now.plant_time_s, 1),
         stopping=running.stop_reason is not None,
     )

@@ -17,11 +17,12 @@ from loopwright.service.jsonable import JsonObject, json_object
 from loopwright.service.offline.recommendation import recommended
 from loopwright.tuning.analysis.assessment import Assessment
 from loopwright.tuning.analysis.step_figures import StepFigures
+from loopwright.tuning.fast.by_model import BY_MODEL
 from loopwright.tuning.gains import Gains, to_parallel
 from loopwright.tuning.models import Model
 from loopwright.tuning.reasons import Ended, Failed, Reason, Refused
 from loopwright.tuning.rules.registry import METHODS, Method, Option
-from loopwright.tuning.rules.tuned import tune
+from loopwright.tuning.tuned import method_of, tune
 
 ALL = "all"
 FORM = "ISA: u = Kp*(b*SP - PV + integral(SP - PV)/Ti + Td*d/dt(c*SP - PV)/(1 + Tf*s)); Ti = 0: no integral"
@@ -76,11 +77,12 @@ def tune_model(model: Model, method: str = ALL, options: Mapping[str, object] | 
 
 def tune_each(model: Model, names: Sequence[str], options: Mapping[str, object] | None = None) -> list[MethodResult]:
     """Tunes the model by the methods named, in this order, as `tune_model` does. Raises BadTuning."""
+    methods = []
     for name in names:
-        if name not in METHODS:
-            meant = did_you_mean(name, list(METHODS))
-            raise BadTuning(f"method must be one of {', '.join(METHODS)}, not {name!r}{meant}")
-    methods = [METHODS[name] for name in names]
+        try:
+            methods.append(method_of(name))
+        except Refused as refused:
+            raise BadTuning(f"{refused.detail}{did_you_mean(name, [BY_MODEL.name, *METHODS])}") from None
     asked = options or {}
     for name, value in asked.items():
         _check(methods, name, value)

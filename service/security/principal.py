@@ -32,3 +32,8 @@ LOCAL = "local"
 """The name of callers on this machine where no keys are required."""
 
 current: ContextVar[Principal] = ContextVar("principal", default=SERVICE)
+
+
+def signed(name: str | None) -> str:
+    """The name under which a change is noted: the person's as given, else that of the caller's key."""
+    return (name or "").strip() or current.get().name

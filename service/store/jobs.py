@@ -118,6 +118,17 @@ class JobEvent:
             return None
         return StageBegun(str(self.data["stage"]), number(self.data["expected_s"]), number(self.data["remaining_s"]))
 
+    def shown(self) -> JsonObject:
+        """Returns what the event says in the names of the API: times that are plant time are called so, and what
+        remains is to the end of the job, as everywhere."""
+        begun = self.stage_begun()
+        if begun is None:
+            return self.data
+        remaining_s = begun.expected_s + begun.remaining_s
+        return {
+            "stage": begun.stage, "expected_plant_time_s": begun.expected_s, "remaining_plant_time_s": remaining_s,
+        }  # fmt: skip
+
     def stage_ended(self) -> StageEnded | None:
         """Returns what the event says of a stage that has ended with a result; None for an event of another kind."""
         if self.kind != "stage_done":

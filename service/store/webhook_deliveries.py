@@ -34,6 +34,7 @@ class Delivery:
     attempts: int
     due_s: float
     error: str | None
+    number: int = 0
 
 
 def add(session: Session, host: str, hook: str, job_id: str, body: str, due_s: float) -> None:
@@ -94,13 +95,20 @@ def delete_over(store: Store, before_s: float) -> None:
         session.execute(delete(Row).where(*over))
 
 
-def latest(store: Store, limit: int) -> list[Delivery]:
-    """Returns the latest messages of every gateway, the latest first. Raises SQLAlchemyError."""
+def latest(store: Store, limit: int, before: int | None = None) -> list[Delivery]:
+    """Returns the latest messages of every gateway, the latest first. Raises SQLAlchemyError.
+
+    before: only those with a smaller number.
+    """
+    wanted = select(Row).order_by(Row.number.desc()).limit(limit)
+    if before is not None:
+        wanted = wanted.where(Row.number < before)
     with store.reading() as session:
-        return [_delivery(row) for row in session.scalars(select(Row).order_by(Row.number.desc()).limit(limit))]
+        return [_delivery(row) for row in session.scalars(wanted)]
 
 
 def _delivery(row: Row) -> Delivery:
     return Delivery(
-        row.id, row.hook, row.job_id, row.body, row.at, DeliveryState(row.state), row.attempts, row.due_s, row.error
+        row.id, row.hook, row.job_id, row.body, row.at, DeliveryState(row.state), row.attempts, row.due_s, row.error,
+        row.number,
     )

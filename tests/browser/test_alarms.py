@@ -50,7 +50,7 @@ def test_a_plant_that_is_switched_off_in_a_test(site: Site, pages: Pages) -> Non
     field.press("Enter")
     expect(abnormal).to_have_title("(1) Loopwright")
     expect(failed).to_have_count(0)
-    (entry,) = site.http.get("/audit?what=alarm_sign_off").json()["entries"]
+    (entry,) = site.http.get("/audit?what=alarm_sign_off").json()
     assert (entry["said_by"], entry["loop"]) == ("B. Berg", TAG)
 
     with pages.expecting("ERR_CONNECTION_REFUSED"):

@@ -21,7 +21,7 @@ def fits(page: Page) -> None:
 @pytest.mark.parametrize("size", [TABLET, PHONE], ids=["tablet", "phone"])
 def test_every_view_fits(site: Site, pages: Pages, size: dict[str, int]) -> None:
     result = site.finished(site.retune())
-    assert site.http.post("/retunes", json={"pattern": ABSENT["tag"]}).status_code == 202
+    assert site.http.post("/retunes", json={"requested_by": "me", "pattern": ABSENT["tag"]}).status_code == 202
     [many] = site.ask("/retunes?limit=1")
     page = pages.open(viewport=size)
     expect(page.locator(".loops")).to_be_visible()

@@ -256,7 +256,7 @@ class Plantsite:
             tuner.close()
 
     def retune(self, tag: str | None = None, **options: Any) -> str:
-        answer = self.http.post(f"/loops/{tag or self.tag}/retune", json=options)
+        answer = self.http.post(f"/loops/{tag or self.tag}/retune", json={"requested_by": "me"} | options)
         assert answer.status_code == 202, answer.text
         return answer.headers["location"]
 

@@ -154,7 +154,7 @@ def _undated(why: str) -> str:
 
 def _alarms(stand: Stand) -> set[str]:
     answer = stand.site.http.get("/alarms")
-    return {each["kind"] for each in answer.json()["alarms"]} if answer.status_code == 200 else set()
+    return {each["kind"] for each in answer.json()} if answer.status_code == 200 else set()
 
 
 def _home_again(stand: Stand) -> None:

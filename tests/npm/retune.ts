@@ -11,6 +11,11 @@ async function rehearsed(tag: string, body: components["schemas"]["FastRetune"])
   for (let job = started.data; ; ) {
     if (job.state !== "queued" && job.state !== "running") {
       if (!job.new_gains) throw new Error(`${job.state}: ${job.detail}`);
+      const log = await client.GET("/jobs/{job_id}/log", { params: { path: { job_id: job.id } } });
+      if (log.error) throw new Error(log.error.detail);
+      const left = log.data.flatMap((each) => (each.kind === "stage_started" ? [each.remaining_plant_time_s] : []));
+      const last = log.data.at(-1);
+      if (!left.length || last?.kind !== "state" || last.state !== job.state) throw new Error(JSON.stringify(log.data));
       return job.new_gains;
     }
     await new Promise((resolve) => setTimeout(resolve, 50));

@@ -122,6 +122,13 @@ def margins(model: Model, gains: Gains) -> Margins:
     )
 
 
+def delay_margin_s(model: Model, gains: Gains) -> float | None:
+    """The delay margin of the loop, s; None for a loop that is not stable, or has no gain crossover. Raises as
+    `margins`."""
+    found = margins(model, gains)
+    return found.delay_margin_s if found.stable else None
+
+
 @dataclass(frozen=True, slots=True)
 class Ultimate:
     """An ultimate point, as measured on the loop, computed from a model, or typed in.

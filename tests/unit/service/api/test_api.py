@@ -20,7 +20,7 @@ GOLDEN = Path(__file__).parents[3] / "golden" / "openapi.json"
 
 
 def start(client: TestClient, **options: Any) -> str:
-    answer = client.post(f"/loops/{TAG}/retune", json=options)
+    answer = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"} | options)
     assert answer.status_code == 202, answer.text
     assert answer.headers["location"] == f"/jobs/{answer.json()['id']}"
     return str(answer.json()["id"])
@@ -92,11 +92,11 @@ def test_busy_loop_answers_409_with_the_active_job(service: Service, client: Tes
     done = finished(service, client)
     service.tune.hold.clear()
     job_id = start(client)
-    answer = client.post(f"/loops/{TAG}/retune", json={})
+    answer = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"})
     body = assert_problem(answer, 409)
     assert body["job"] == f"/jobs/{job_id}" == answer.headers["location"]
     assert assert_problem(client.post(f"{done['url']}/accept"), 409)["job"] == f"/jobs/{job_id}"
-    assert client.post("/loops/FIC-2/retune", json={}).status_code == 202
+    assert client.post("/loops/FIC-2/retune", json={"requested_by": "me"}).status_code == 202
 
 
 def test_progress_and_abort(service: Service, client: TestClient) -> None:
@@ -202,7 +202,7 @@ def test_not_found(shared_client: TestClient, path: str) -> None:
 def test_other_http_errors_are_problems(shared_client: TestClient) -> None:
     assert_problem(shared_client.delete("/loops"), 405)
     assert_problem(shared_client.get("/jobs?limit=0"), 422)
-    assert_problem(shared_client.post("/loops/NONE/retune", json={}), 404)
+    assert_problem(shared_client.post("/loops/NONE/retune", json={"requested_by": "me"}), 404)
 
 
 def test_samples_as_columns_and_as_csv(service: Service, client: TestClient) -> None:
@@ -266,7 +266,8 @@ def test_a_dry_run_touches_nothing_and_does_not_block(service: Service, client: 
 
 def test_stopping_takes_no_new_work(service: Service, client: TestClient) -> None:
     service.jobs.request_stop()
-    assert assert_problem(client.post(f"/loops/{TAG}/retune", json={}), 503)["reason"] == "service_stopped"
+    answer = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"})
+    assert assert_problem(answer, 503)["reason"] == "service_stopped"
 
 
 def test_a_list_of_jobs_asks_the_database_as_often_however_long_it_is(service: Service, client: TestClient) -> None:

@@ -208,7 +208,7 @@ def test_gains_of_fast_for_another_Ms(service: Service, client: TestClient, Ms: 
     assert asked.model is not None
     plant = asked.model.plant()
     assert plant.num[-1] / plant.den[-1] == pytest.approx(2.0) and plant.L == 1.0
-    assert client.post(f"/loops/{job['loop']}/retune", json=fast["retune"]).status_code == 202
+    assert client.post(f"/loops/{job['loop']}/retune", json=fast["retune"] | {"requested_by": "me"}).status_code == 202
 
 
 def test_the_aim_of_other_gains_is_that_of_the_job_unless_another_is_asked_for(
@@ -249,7 +249,7 @@ def test_other_gains_keep_the_movement_of_MV_that_the_job_asked_for_and_the_sett
     assert (never["outcome"], never["reason"], never["retune"]) == ("refused", "not_possible", None)
     again = found(f"&settling_s={re.findall(r'at least ([0-9.]+) s', never['detail'])[0]}")
     assert again["outcome"] == "tuned"
-    assert client.post(f"/loops/{job['loop']}/retune", json=again["retune"]).status_code == 202
+    assert client.post(f"/loops/{job['loop']}/retune", json=again["retune"] | {"requested_by": "me"}).status_code == 202
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def test_a_decision_in_the_wrong_state_names_the_state(service: Service, client:
 def test_a_busy_loop_is_named_with_its_job(service: Service, client: TestClient) -> None:
     service.tune.hold.clear()
     job_id = start(client)
-    body = assert_problem(client.post(f"/loops/{TAG}/retune", json={}), 409)
+    body = assert_problem(client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}), 409)
     assert (body["reason"], body["job"]) == ("loop_busy", f"/jobs/{job_id}")
 
 

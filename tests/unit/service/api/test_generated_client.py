@@ -25,7 +25,7 @@ import sys
 import time
 
 from {PACKAGE} import AuthenticatedClient
-from {PACKAGE}.api.jobs import get_job
+from {PACKAGE}.api.jobs import get_job, list_job_events
 from {PACKAGE}.api.loops import list_loops, retune_loop
 from {PACKAGE}.api.tunings import tune_model
 from {PACKAGE}.models import (
@@ -39,6 +39,8 @@ from {PACKAGE}.models import (
     Problem,
     RuleRetune,
     RuleRetuneMethod,
+    StageStartedEvent,
+    StateEvent,
     TuningRequest,
 )
 
@@ -60,6 +62,11 @@ def rehearsed(client: AuthenticatedClient, tag: str, wanted: FastRetune | FiveSt
         assert isinstance(now, JobView), now
         started = now
     assert started.state is JobState.REHEARSED and started.new_gains is not None, started
+    events = list_job_events.sync(started.id, client=client)
+    assert isinstance(events, list)
+    stages = {{event.stage: event.remaining_plant_time_s for event in events if isinstance(event, StageStartedEvent)}}
+    assert [event.state for event in events if isinstance(event, StateEvent)][-1] == started.state
+    assert [event.id for event in events] == list(range(1, len(events) + 1)) and stages, events
     return started.new_gains
 
 

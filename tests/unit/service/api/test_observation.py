@@ -169,7 +169,7 @@ def test_the_test_of_a_neighbour_is_said_and_left_out(service: Service) -> None:
     service.tune.hold.clear()
     with asked(service, heard()) as client:
         assert client.get(f"/loops/{TAG}").json()["disturbed_by"] is None
-        job = client.post("/loops/FIC-2/retune", json={}).json()
+        job = client.post("/loops/FIC-2/retune", json={"requested_by": "me"}).json()
         assert service.tune.inside.wait(60)
         assert client.get(f"/loops/{TAG}").json()["disturbed_by"] == f"FIC-2 is under test (job {job['id']})"
         assert client.get("/loops/FIC-2").json()["disturbed_by"] is None, "it is the one under test"
@@ -189,7 +189,7 @@ def test_a_silent_loop_an_unknown_one_and_a_wrong_question(service: Service) -> 
     with asked(service, Rings()) as client:
         assert_problem(client.get("/loops/NONE/observation"), 404)
         assert client.get(f"/loops/{TAG}/observation?ms=3").status_code == 422
-        job = client.post(f"/loops/{TAG}/retune", json={"method": "observe"})
+        job = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me", "method": "observe"})
         assert job.status_code == 422 and "GET /loops/TAG/observation" in job.text
         service.controller.absent = Reason.NODE_LOST
         assert client.get(f"/loops/{TAG}/observation").status_code == 503

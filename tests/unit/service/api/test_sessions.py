@@ -108,7 +108,7 @@ def test_what_a_change_must_show(browsers: Browsers, headers: dict[str, str], wi
     if without:
         del browser.headers[CSRF]
     sent = {name: value.encode("latin-1") for name, value in headers.items()}
-    answer = browser.post(f"/loops/{TAG}/retune", json={}, headers=sent)
+    answer = browser.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}, headers=sent)
     assert answer.status_code == status
     if status == 403:
         assert any(word in assert_problem(answer, 403)["detail"] for word in ("/session", "/ui/"))
@@ -131,7 +131,7 @@ def test_bearer_keys_are_as_before(browsers: Browsers) -> None:
     bearer = {"Authorization": f"Bearer {browsers.keyring.create('script', Scope.OPERATE)[1]}"}
     assert browser.get("/session", headers=bearer).json()["name"] == "script"
     assert browser.get("/session", headers=bearer).json()["csrf"] is None
-    answer = browser.post(f"/loops/{TAG}/retune", json={}, headers=bearer | {"Origin": "https://any.example"})
+    answer = browser.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}, headers=bearer | {"Origin": "https://any.example"})
     assert answer.status_code == 202
     assert_problem(browser.delete("/session", headers=bearer), 409)
     assert browser.get("/loops", headers={"Authorization": "Bearer wrong"}).status_code == 401
@@ -140,7 +140,7 @@ def test_bearer_keys_are_as_before(browsers: Browsers) -> None:
 @pytest.mark.parametrize("has", Scope)
 def test_scopes_are_those_of_the_key(browsers: Browsers, has: Scope) -> None:
     browser = browsers.signed_in(has)
-    answer = browser.post(f"/loops/{TAG}/retune", json={})
+    answer = browser.post(f"/loops/{TAG}/retune", json={"requested_by": "me"})
     assert answer.status_code == (403 if has is Scope.READ else 202)
     assert browser.get("/audit").status_code == (200 if has is Scope.ADMIN else 403)
 

@@ -269,7 +269,7 @@ class TestWhichJob:
     def ids(self, service: Service, through: Through) -> list[str]:
         found = []
         for _ in range(3):
-            found.append(str(through.post(f"/loops/{TAG}/retune")["id"]))
+            found.append(str(through.post(f"/loops/{TAG}/retune", {"requested_by": "me"})["id"]))
             service.wait(found[-1])
         return found
 
@@ -330,7 +330,7 @@ class TestWhichJob:
 
 
 def test_ids_and_times_are_whole_on_eighty_columns(service: Service, through: Through) -> None:
-    job = through.post(f"/loops/{TAG}/retune")["id"]
+    job = through.post(f"/loops/{TAG}/retune", {"requested_by": "me"})["id"]
     service.wait(job)
     (line,) = (line for line in run("jobs").output.splitlines() if TAG in line)
     assert job in line and " s ago" in line and len(line) <= 80
@@ -411,7 +411,7 @@ def test_how_long_ago() -> None:
 
 
 def test_the_retunes_of_many_loops(service: Service, through: Through) -> None:
-    retune = through.post("/retunes", {"pattern": "*"})["id"]
+    retune = through.post("/retunes", {"requested_by": "me", "pattern": "*"})["id"]
     listed = run("retunes")
     assert listed.exit_code == 0 and retune in listed.output and " s ago" in listed.output
     assert json.loads(run("retunes", "--json").stdout)[0]["id"] == retune
@@ -423,7 +423,7 @@ def test_the_version() -> None:
 
 
 def test_a_job_without_a_record_has_no_picture(service: Service, through: Through, tmp_path: Path) -> None:
-    job = through.post(f"/loops/{TAG}/retune")["id"]
+    job = through.post(f"/loops/{TAG}/retune", {"requested_by": "me"})["id"]
     service.wait(job)
     result = run("job", job, "--plot", str(tmp_path / "job.png"))
     assert result.exit_code == 1 and "neither a relay's record nor a set-point step" in result.output
@@ -432,7 +432,7 @@ def test_a_job_without_a_record_has_no_picture(service: Service, through: Throug
 @pytest.fixture
 def proposed(service: Service, through: Through) -> str:
     """The id of a job whose proposal waits for a decision, and which has no record to be drawn."""
-    job = through.post(f"/loops/{TAG}/retune")["id"]
+    job = through.post(f"/loops/{TAG}/retune", {"requested_by": "me"})["id"]
     service.wait(job)
     assert service.store.get(job).state == "proposed"
     through.paths.clear()

@@ -138,7 +138,7 @@ def test_a_retune_that_is_on_its_way_is_followed_instead_of_starting_others(
     service: Service, through: Through, screen: io.StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service.tune.hold.clear()
-    begun = through.post(f"/loops/{TAG}/retune", {"method": "fast"})
+    begun = through.post(f"/loops/{TAG}/retune", {"requested_by": "me", "method": "fast"})
     assert service.tune.inside.wait(20)
     follow = job_tables.follow
 

@@ -86,7 +86,7 @@ def test_the_audit_log_says_who_has_asked_and_at_which_gateway(fleet: TwoGateway
     assert (row.who, row.key_id, row.address, row.gateway) == ("control room", "0f3ac2d9be11", "10.0.0.7", HERE)
     assert (row.said_by, row.loop) == ("A. Lind", TAG_THERE)
     fleet.there.decide(job, "rollback")  # at home, over HTTP
-    entries = fleet.here.http.get("/audit", params={"what": "rollback"}).json()["entries"]
+    entries = fleet.here.http.get("/audit", params={"what": "rollback"}).json()
     assert [(each["said_by"], each["gateway"]) for each in entries] == [("A. Lind", THERE)]
     decisions = fleet.here.http.get("/decisions", params={"loop": TAG_THERE}).json()
     assert [(each["what"], each["gateway"]) for each in decisions][:2] == [("rollback", THERE), ("accept", HERE)]

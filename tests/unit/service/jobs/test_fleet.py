@@ -200,7 +200,7 @@ def test_abort_stops_what_runs_and_begins_nothing_more(plant: Plant) -> None:
     with pytest.raises(RetuneOver, match=r"ended at .* as aborted: nothing of it is left to stop"):
         plant.fleet.abort(retune, "me")
     what = [(row.what, row.said_by) for row in audit.trail(plant.store.engine, 10)]
-    assert ("retune_many_abort", "me") in what and ("retune_many", "api") in what
+    assert ("retune_many_abort", "me") in what and ("retune_many", "service") in what
 
 
 def test_a_retune_stopped_while_its_next_job_is_made_has_no_such_job(plant: Plant) -> None:
@@ -488,7 +488,7 @@ def test_a_retune_of_many_over_http(plant: Plant, client: TestClient) -> None:
     assert client.post(f"{body['url']}/abort").status_code == 409
     assert client.get("/retunes/none").status_code == 404
     assert client.post("/retunes/none/abort").status_code == 404
-    refused = client.post("/retunes", json={"loops": ["Z"]})
+    refused = client.post("/retunes", json={"requested_by": "me", "loops": ["Z"]})
     assert refused.status_code == 422 and refused.json()["reason"] == "bad_input"
     assert [one["id"] for one in client.get("/retunes").json()] == [body["id"]]
 

@@ -106,16 +106,16 @@ def test_a_loop_that_is_not_there(service: Service, client: TestClient) -> None:
 
 def test_no_test_begins_but_a_rehearsal_may(service: Service, client: TestClient) -> None:
     locked(client)
-    problem = assert_problem(client.post(f"/loops/{TAG}/retune", json={}), 409)
+    problem = assert_problem(client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}), 409)
     assert problem["reason"] == "locked" and "loopwright unlock" in problem["advice"] and WHY in problem["detail"]
     assert service.store.recent() == []
-    assert client.post("/loops/FIC-2/retune", json={}).status_code == 202
+    assert client.post("/loops/FIC-2/retune", json={"requested_by": "me"}).status_code == 202
     job = client.post(f"/loops/{TAG}/retune", json={"dry_run": True})
     assert job.status_code == 202
     service.wait(job.json()["id"])
     assert service.store.get(job.json()["id"]).state == "rehearsed"
     client.post(f"/loops/{TAG}/unlock")
-    assert client.post(f"/loops/{TAG}/retune", json={}).status_code == 202
+    assert client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).status_code == 202
 
 
 def test_no_decision_writes_to_it(service: Service, client: TestClient) -> None:
@@ -172,7 +172,7 @@ def test_a_lock_waits_for_a_decision_that_writes(service: Service) -> None:
 
 def test_a_running_test_goes_on_and_the_answer_says_how_to_end_it(service: Service, client: TestClient) -> None:
     service.tune.hold.clear()
-    job = client.post(f"/loops/{TAG}/retune", json={}).json()["id"]
+    job = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()["id"]
     assert service.tune.inside.wait(10)
     answer = locked(client).json()
     assert answer["running_job"] == f"/jobs/{job}" and f"loopwright job {job} --abort" in answer["note"]
@@ -183,7 +183,7 @@ def test_a_running_test_goes_on_and_the_answer_says_how_to_end_it(service: Servi
 
 def test_a_running_test_may_be_aborted_and_the_loop_is_made_safe(service: Service, client: TestClient) -> None:
     service.tune.hold.clear()
-    job = client.post(f"/loops/{TAG}/retune", json={}).json()["id"]
+    job = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()["id"]
     assert service.tune.inside.wait(10)
     locked(client)
     assert client.post(f"/jobs/{job}/abort").status_code == 202
@@ -247,7 +247,7 @@ def test_a_locked_loop_is_looked_after(service: Service, client: TestClient) -> 
 
 def test_a_retune_of_many_skips_it_and_says_so(service: Service, client: TestClient) -> None:
     locked(client)
-    url = client.post("/retunes", json={"pattern": "*", "stop_after_failures": 1}).json()["url"]
+    url = client.post("/retunes", json={"requested_by": "me", "pattern": "*", "stop_after_failures": 1}).json()["url"]
     for _ in range(5000):
         found = client.get(url).json()
         if found["ended_at"]:

@@ -43,7 +43,7 @@ def alarms(client: TestClient, *kinds: str) -> list[dict[str, Any]]:
     """The alarms, when they are of these kinds; a look at what is abnormal serves all who ask for a quarter second."""
     found: list[dict[str, Any]] = []
     for _ in range(600):
-        found = client.get("/alarms").json()["alarms"]
+        found = client.get("/alarms").json()
         if [each["kind"] for each in found] == list(kinds):
             break
         time.sleep(0.05)
@@ -319,7 +319,7 @@ def test_the_old_gains_are_not_put_back_where_that_is_in_doubt(
     assert trouble.why_not is not None and why in trouble.why_not
     assert service.controller.state.gains == held and service.store.get(here.job_id).state is JobState.ACCEPTED
     service.controller.absent = None
-    alarm = client.get("/alarms").json()["alarms"][0]
+    alarm = client.get("/alarms").json()[0]
     assert (alarm["level"], alarm["kind"]) == (1, "suspect_gains") and why in alarm["advice"]
     here.goes_on(5.0)
     assert here.watch.trouble == trouble, "it is tried once"

@@ -185,7 +185,7 @@ def test_a_loop_of_this_gateway_that_has_fallen_silent(fleet: TwoGateways) -> No
 def test_how_far_a_job_of_the_other_gateway_has_come(fleet: TwoGateways) -> None:
     """Of a gateway that says nothing it is what its job has stored: nothing before its first stage."""
     fleet.there.tune.hold.clear()
-    job = fleet.there.http.post(f"/loops/{TAG_THERE}/retune", json={}).json()["url"]
+    job = fleet.there.http.post(f"/loops/{TAG_THERE}/retune", json={"requested_by": "me"}).json()["url"]
     assert fleet.there.tune.inside.wait(60)
     fleet.write()
 
@@ -370,7 +370,7 @@ def test_the_stream_shows_rows_buses_and_progress_of_the_other_gateway(fleet: Tw
 
     app = create_app(fleet.here.jobs, checks={}, listening=fleet.here.listening, live=live, others=fleet.here.others)
     fleet.there.tune.hold.clear()
-    job = fleet.there.http.post(f"/loops/{TAG_THERE}/retune", json={}).json()["url"]
+    job = fleet.there.http.post(f"/loops/{TAG_THERE}/retune", json={"requested_by": "me"}).json()["url"]
     assert fleet.there.tune.inside.wait(20)
     with served(app) as door:
         try:

@@ -359,7 +359,7 @@ class TestHttp:
         assert found["would_start"] and found["stages"][1]["stage"] == "baseline"
         assert service.store.recent() == [] and service.controller.session_last == 0 == service.controller.open
         assert service.controller.state == before
-        assert client.get("/audit").json()["entries"] == []
+        assert client.get("/audit").json() == []
 
     def test_a_silent_controller(self, service: Service, client: TestClient) -> None:
         service.controller.absent = Reason.NODE_LOST
@@ -368,7 +368,7 @@ class TestHttp:
 
     def test_a_busy_loop_is_told_as_its_job_has_found_it(self, service: Service, client: TestClient) -> None:
         service.tune.hold.clear()
-        job = client.post(f"/loops/{TAG}/retune").json()
+        job = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()
         assert service.tune.inside.wait(5)
         service.controller.state = replace(service.controller.state, sp=52.0, mode=Mode.EXPERIMENT)
         found = self.ask(client)
@@ -390,7 +390,7 @@ class TestHttp:
         for job in jobs:
             service.wait(job)
         service.tune.ends = Failed(Reason.NODE_LOST, "silent")
-        service.wait(client.post(f"/loops/{TAG}/retune").json()["id"])
+        service.wait(client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()["id"])
         known = self.ask(client)["known"]
         assert (known["model_job"], known["Pu_s"]) == (f"/jobs/{jobs[0]}", 3.32)
 

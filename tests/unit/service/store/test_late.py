@@ -79,7 +79,7 @@ def problem_of(service: Service, path: str) -> str:
 
     from loopwright.service.api.app import create_app
 
-    answer = TestClient(create_app(service.jobs, checks={})).post(path, json={})
+    answer = TestClient(create_app(service.jobs, checks={})).post(path, json={"requested_by": "me"})
     return str(assert_problem(answer, 409)["detail"])
 
 

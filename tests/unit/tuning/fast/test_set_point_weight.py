@@ -18,7 +18,7 @@ from loopwright.tuning.fast.proposal import comparison_on
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, TransferFunction, sign
 from loopwright.tuning.reasons import Reason, Refused
-from loopwright.tuning.rules.tuned import tune
+from loopwright.tuning.tuned import tune
 from tests.unit.tuning.fast.records import BENCHES
 
 HEATER = FOPDT(0.8, 120.0, 15.0)

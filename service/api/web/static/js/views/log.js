@@ -1,7 +1,7 @@
 // @ts-check
 /** The audit log: who changed what. */
 import { useEffect, useState } from "../../vendor/hooks.js";
-import { ask } from "../api.js";
+import { askPage } from "../api.js";
 import { html } from "../html.js";
 import { when } from "../numbers.js";
 import { jobPath, loopPath } from "../router.js";
@@ -12,7 +12,7 @@ export function LogView() {
   const [problem, setProblem] = useState("");
   const look = async (/** @type {string} */ path, /** @type {any[]} */ before) => {
     try {
-      const page = await ask(path);
+      const page = await askPage(path);
       setEntries([...before, ...page.entries]);
       setNext(page.next);
     } catch (error) {

@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from numpy.typing import ArrayLike
-
 from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.analysis.notebook import as_html
 from loopwright.tuning.analysis.step_response import step_response
+from loopwright.tuning.fast.by_model import BY_MODEL
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import LinearSystem, Model, as_model
+from loopwright.tuning.models import AnyModel, Model, as_model
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.design import realisable
 from loopwright.tuning.rules.registry import METHODS, Method
@@ -94,23 +93,34 @@ class Tuned:
         return found.getvalue()
 
 
+def method_of(name: str) -> Method:
+    """The method of this name for a known model: a rule of `METHODS`, or the design of fast. Raises Refused,
+    BAD_INPUT."""
+    if name == BY_MODEL.name:
+        return BY_MODEL
+    if name not in METHODS:
+        known = f"{BY_MODEL.name}, {', '.join(METHODS)}"
+        raise Refused(Reason.BAD_INPUT, f"method must be one of {known}, not {name!r}")
+    return METHODS[name]
+
+
 def tune(
-    model: Model | LinearSystem | tuple[ArrayLike, ArrayLike],
+    model: AnyModel,
     method: str = "simc",
     dead_time_s: float = 0.0,
     **options: object,
 ) -> Tuned:
     """The gains that a method gives for a model, with their assessment.
 
-    model: a model of this library, or a transfer function of another one (control, scipy.signal).
-    method, options: a name of `METHODS`, and options of that method.
+    model: a model of this library, what `identify` has found, a transfer function of another library (control,
+    scipy.signal), or a model by names, as `as_model` takes it.
+    method, options: a name of `METHODS`, and options of that method; or "fast", whose design for a maximum sensitivity
+    (ms=1.6) is the one that the procedure `tuning.fast` makes of the model that it has found.
     dead_time_s: the dead time of a transfer function of another library, s.
     Raises Refused: BAD_INPUT (method, option), or as the rule does: NOT_SELF_REGULATING, OUTSIDE_RANGE,
     CANNOT_OSCILLATE. Raises TypeError for what is no model, ValueError for coefficients that make none.
     """
-    if method not in METHODS:
-        raise Refused(Reason.BAD_INPUT, f"method must be one of {', '.join(METHODS)}, not {method!r}")
-    plant, by = as_model(model, dead_time_s), METHODS[method]
+    plant, by = as_model(model, dead_time_s), method_of(method)
     setting = by.tune(plant, **options)
     gains, notes = realisable(setting.gains, by.filter)
     found = assess(plant, gains)
