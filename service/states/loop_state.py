@@ -54,6 +54,17 @@ def differences(state: LoopState, home: LoopState) -> dict[str, str]:
     return found
 
 
+def after_false_pv(state: LoopState) -> str:
+    """Returns in words what a loop is after a test that has found PV to be false, and who has to act."""
+    if state.mode is Mode.AUTOMATIC:
+        return "PV is false, and the loop is in automatic: an operator has to look at it now, and to put it in manual"
+    mode, mv = state.mode.name.lower(), state.manual_output if state.mode is Mode.MANUAL else state.mv
+    return (
+        f"PV is false: the loop is in {mode} at MV {mv:.6g}, and nothing controls PV until an operator has mended the "
+        "sensor and puts the loop in automatic"
+    )
+
+
 def same_gains(one: Gains, other: Gains) -> bool:
     """Whether the gains are the same as far as REAL32 tells. Kp is compared by the ratio alone: where PV has a large
     span, Kp is smaller than what counts as 0 elsewhere."""
