@@ -196,6 +196,7 @@ class _Run(Generic[T]):
 
     def _hold(self) -> None:
         """Holds the loop at the MV before the test: no control law may answer a false PV."""
+        self._on_event(Note(f"PV is false: {self._result.ended.detail if self._result.ended else ''}"))
         try:
             self._loop.hold()
         except Ended as ended:
