@@ -90,6 +90,8 @@ FOUND_BY = {
     "count-is-not-checked": ("stranger", 5),
     "set-point-stays": ("stalls", 1),
     "manual-output-stays": ("manual", 767),
+    "hold-keeps-automatic": ("false_pv", 85),
+    "hold-is-not-looked-for": ("false_pv", 863),
     "gains-are-not-compared": ("watched", 27),
 }
 
