@@ -16,7 +16,7 @@ from loopwright.service.alarms.alarm import RULES, Alarm, AlarmKind
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.listening.heard_node import HeardHeartbeat
-from loopwright.service.states.acceptance_watch import AcceptanceWatch, Trouble, instead_in_words
+from loopwright.service.states.acceptance_watch import AcceptanceWatch, Trouble, TroubleKind, instead_in_words
 from loopwright.service.states.job_state import JobState
 from loopwright.service.states.loop_state import LoopState, loop_state, same_gains
 from loopwright.service.store.alarms import NOT_RESTORED_TEXT, FalsePvJob, UnconfirmedJob, alarm_id
@@ -215,6 +215,12 @@ def _watches(known: AlarmFacts) -> Iterator[Condition]:
         if trouble is None:
             kind, since_s = AlarmKind.MODEL_MISMATCH, None
             text, advice = _mismatch(each.watch), "Roll the new gains back, or retune the loop. " + _UNTIL_SIGNED
+        elif trouble.kind is TroubleKind.FALSE_PV:
+            kind, since_s, text = AlarmKind.FALSE_PV, _seconds(trouble.at), f"PV is false. {trouble.text}"
+            advice = (
+                "Look at the sensor and the loop now: it is in automatic on this PV unless you put it in manual. "
+                f"Nothing was written to it, and the watch puts no gains back. {_UNTIL_SIGNED}"
+            )
         elif trouble.put_back:
             kind, since_s = AlarmKind.ROLLED_BACK, _seconds(trouble.at)
             text = f"The old gains were put back by the watch: {trouble.text}"
