@@ -6,7 +6,7 @@ own). `controller.session` decides who may command what, and when a test ends.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from loopwright.controller.pid import Parameters, Pid
 from loopwright.controller.relay import Relay, RelaySettings
@@ -59,6 +59,10 @@ class Home:
     setpoint: float
     manual_output: float
     mv: float
+
+    def held(self) -> Home:
+        """Returns the state in place of this one where PV is false: AUTOMATIC becomes MANUAL at this MV."""
+        return replace(self, mode=Mode.MANUAL, manual_output=self.mv) if self.mode is Mode.AUTOMATIC else self
 
 
 class Channel:

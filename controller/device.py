@@ -323,6 +323,8 @@ class ControllerDevice:
             self.runtime.listen(each.holder for each in self.sessions)
             for code in _ENDED_BY.values():
                 self.runtime.clear_error(code, bytes((sub,)))
+        if order is Order.HOLD:
+            self._write_soon()  # not first with the next tick: a restart must not go back to automatic
         self._report_if_new(sub - 1)
         self._send_unasked(sub - 1)
 

@@ -4,7 +4,8 @@ A tuner opens a session with a number that the controller has given out, and com
 number and a running count (`protocol.session`). The session ends when the tuner closes it, when the lease or the
 tuner's heartbeat runs out, when PV is lost or leaves the limits that the tuner has set, when the node leaves
 operational, or when an operator or another master commands something; the controller itself then restores mode,
-set-point, manual output and gains. Time is an argument: seconds of the controller's clock.
+set-point, manual output and gains. Where the tuner has found that PV is false, its order HOLD replaces AUTOMATIC by
+MANUAL at the MV before the test in what is restored. Time is an argument: seconds of the controller's clock.
 """
 
 from __future__ import annotations
@@ -57,6 +58,8 @@ class Session:
         self.cause = Cause.NONE
         self.outside_changes = OutsideChange.NONE
         self.home = _NO_HOME
+        self.held = False
+        """Whether HOLD was ordered in the session that is open, or ended last."""
         self.home_gains = channel.accepted
         self.terms: Terms | None = None
         self.pv_limits: tuple[float, float] | None = None
@@ -71,7 +74,7 @@ class Session:
         self.silent = True
         """Whether there has been no valid PV for too long."""
         self._unsettled = False
-        """Whether a session has ended and no sample has yet carried the resulting output to the plant."""
+        """Whether the channel has gone home and no sample has yet carried the resulting output to the plant."""
         self.unasked = False
         """Whether the output has moved without a PV; the device sends the output and resets this."""
         self._without_pv = False
@@ -113,6 +116,8 @@ class Session:
             return
         if (order is Order.OPEN) == self.is_open:
             raise SdoAbort(Abort.DEVICE_STATE)
+        if self.is_open and self.held and order not in (Order.CLOSE, Order.HOLD):  # a held loop is not moved any more
+            raise SdoAbort(Abort.DEVICE_STATE)
         number, count = (self.next, 0) if order is Order.OPEN else (self.number, self.count)
         if check != check_of(number, count, order, values):
             raise SdoAbort(Abort.INVALID_VALUE)
@@ -133,6 +138,8 @@ class Session:
                 self._open(Terms(int(numbers[0]), int(numbers[1]), *(ms / 1000.0 for ms in numbers[2:])), now)
             case Order.CLOSE:
                 self.end(Cause.CLOSED)
+            case Order.HOLD:
+                self._hold()
             case Order.SETPOINT:
                 channel.setpoint = numbers[0]
             case Order.MODE:
@@ -159,11 +166,17 @@ class Session:
                     store(gains)
                     channel.accept(gains)
 
+    def _hold(self) -> None:
+        """Goes home at once, and for AUTOMATIC to MANUAL at the MV before the test: there is no PV to control by."""
+        self.home, self.held = self.home.held(), True
+        self._go_home(RelayState.DONE)
+        self.settle()
+
     def _open(self, terms: Terms, now: float) -> None:
         if self.channel.on_trial:  # an operator has gains on trial, which a session would end
             raise SdoAbort(Abort.DEVICE_STATE)
         self.number, self.terms, self.home = self.next, terms, self.channel.home
-        self.home_gains, self.pv_limits = self.channel.accepted, None
+        self.home_gains, self.pv_limits, self.held = self.channel.accepted, None, False
         self.next, self.count, self.outside_changes = self._draw(), 0, OutsideChange.NONE
         self._samples_left = terms.lease_samples
         self._lease_until, self._heard_at, self._valid_at = now + terms.lease_s, now, max(now, self._valid_at)
@@ -256,14 +269,18 @@ class Session:
     def _end(self, cause: Cause) -> None:
         if self.is_open:
             state = RelayState.ENDED_BY_LIMIT if cause is Cause.PV_LIMIT else RelayState.DONE
-            self.channel.go_home(self.home, state)
-            self.last, self.number, self.terms, self.cause = self.number, 0, None, cause
+            self._go_home(state)
+            self.last, self.number, self.terms = self.number, 0, None
+            self.cause = Cause.HELD if self.held else cause
             self.pv_limits = None
-            self._unsettled = True
+
+    def _go_home(self, relay_state: RelayState) -> None:
+        self.channel.go_home(self.home, relay_state)
+        self._unsettled = True
 
     def settle(self, operational: bool = True) -> None:
-        """Where no PV will ask for the output that results from the end of a session, sets it at once: to the output of
-        the mode, in AUTOMATIC to the MV before the test."""
+        """Where no PV will ask for the output that results from going home, sets it at once: to the output of the mode,
+        in AUTOMATIC to the MV before the test."""
         if (self._unsettled or self._without_pv) and not (operational and self.pv_is_valid):
             # A later command continues from the output that the end of the session has left.
             self.channel.without_pv(self.home.mv if self._unsettled else self.channel.mv)

@@ -221,6 +221,7 @@ _ORDERS = {
     Order.TRY: "gains on trial",
     Order.ACCEPT: "accept these gains",
     Order.WATCH: "end the session where PV leaves these limits",
+    Order.HOLD: "hold the MV of the opening in manual, from now on and after the session",
 }
 
 

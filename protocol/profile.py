@@ -68,6 +68,8 @@ class Cause(IntEnum):
     NO_PV = 6
     RELAY_SAMPLES = 7
     OUTSIDE_CHANGE = 8
+    HELD = 9
+    """The tuner had ordered HOLD: whatever ended the session then, the channel is in manual at the MV of home."""
 
 
 class OutsideChange(IntFlag):
@@ -94,6 +96,7 @@ class Order(IntEnum):
     TRY = 6
     ACCEPT = 7
     WATCH = 8
+    HOLD = 9
 
 
 class ParameterCommand(IntEnum):

@@ -28,6 +28,7 @@ STAGED: dict[Order, tuple[str, ...]] = {
     Order.TRY: tuple(f"controller_session_{name}" for name in GAINS),
     Order.ACCEPT: tuple(f"controller_session_{name}" for name in GAINS),
     Order.WATCH: ("controller_session_pv_low", "controller_session_pv_high"),
+    Order.HOLD: (),
 }  # fmt: skip
 """The objects that hold the values of an order, in the order in which the check covers them."""
 

@@ -40,7 +40,7 @@ _BACKLOG_S = 30.0
 """Time for which they are searched for an answer, or for all segments of one, s: a plant at full speed leaves thousands
 of them to a busy machine."""
 _ABORT = 0x80
-_URGENT = ("controller_session_renewal", "controller_order_close")
+_URGENT = ("controller_session_renewal", "controller_order_close", "controller_order_hold")
 RENEWAL_S = 0.5
 """Wall time between two renewals of a session's lease, s. They are not answered, and some may be lost."""
 TURN_S = 10.0

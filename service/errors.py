@@ -67,6 +67,12 @@ class Locked(_OfOneReason):
     of = Reason.LOCKED
 
 
+class NotAcknowledged(Locked):
+    """A test has found PV of the loop to be false, and no person has acknowledged that: no test begins on it."""
+
+    of = Reason.NOT_ACKNOWLEDGED
+
+
 class RemoteSetpoint(_OfOneReason):
     """Another controller moves the set-point of the loop, so that the set-point cannot be pulsed."""
 

@@ -47,6 +47,7 @@ class Reason(StrEnum):
     CONTROLLER_MISMATCH = "controller_mismatch"
     DIVERGES = "diverges"
     LOCKED = "locked"
+    NOT_ACKNOWLEDGED = "not_acknowledged"
     # no gain
     NO_GAIN = "no_gain"
     # failed
@@ -120,13 +121,19 @@ ADVICE: dict[Reason, str] = {
     Reason.DIVERGES: "PV ran away under the new gains, which were taken back: keep the present gains, and repeat.",
     Reason.LOCKED: "Somebody has locked the loop: ask them, or unlock it on its page (or by loopwright unlock TAG), "
     "then ask again.",
+    Reason.NOT_ACKNOWLEDGED: "The last test found PV to be false, and nobody has acknowledged that: check the sensor, "
+    "sign the alarm off (or loopwright dismiss TAG), then ask again.",
     Reason.NO_GAIN: "The loop is already tuned as well as asked: nothing needs to be done. For a faster or a more "
     "robust loop ask for another Ms, for a proposal all the same set propose_anyway.",
     Reason.PV_LIMIT: "PV reached its limit: permit less MV deviation, or widen the PV limits if it is safe.",
     Reason.TIME_BUDGET: "The test took longer than its budget: check T95, or raise the budget.",
-    Reason.BAD_SAMPLE: "A sample was not a finite number: check the sensor and its scaling.",
+    Reason.BAD_SAMPLE: "PV was not a finite number, or jumped as the plant cannot: check the sensor and its scaling. "
+    "Where the loop was put in manual for it, control it by hand; when PV is right again, sign the alarm off (or "
+    "loopwright dismiss TAG), put the loop in automatic, then retune.",
     Reason.SAMPLES_LOST: "Samples were lost on the way: check bus load, or run a simulated plant more slowly.",
-    Reason.PV_FROZEN: "PV did not change at all while MV did: check the sensor.",
+    Reason.PV_FROZEN: "PV stood still as the plant cannot: check the sensor. A loop that was in automatic was put in "
+    "manual for it: control it by hand; when PV is right again, sign the alarm off (or loopwright dismiss TAG), put "
+    "the loop in automatic, then retune.",
     Reason.SETPOINT_CHANGED: "Somebody else moved the set-point during the test; agree on the time and repeat.",
     Reason.MODE_CHANGED: "Somebody else changed the mode during the test; agree on the time and repeat.",
     Reason.GAINS_CHANGED: "Somebody else tried other gains during the test; agree on the time and repeat.",

@@ -16,6 +16,7 @@ class AlarmKind(StrEnum):
     """The value is what the API shows and the database holds."""
 
     NOT_RESTORED = "not_restored"
+    FALSE_PV = "false_pv"
     BUS_DOWN = "bus_down"
     NODE_LOST = "node_lost"
     NODE_NOT_OPERATIONAL = "node_not_operational"
@@ -47,6 +48,7 @@ class KindRule:
 
 RULES: dict[AlarmKind, KindRule] = {
     AlarmKind.NOT_RESTORED: KindRule(1, 0.0, 0.0, True),
+    AlarmKind.FALSE_PV: KindRule(1, 0.0, 0.0, True),
     AlarmKind.BUS_DOWN: KindRule(2, 3.0, 3.0, False),
     AlarmKind.NODE_LOST: KindRule(2, 3.0, 3.0, False),
     AlarmKind.NODE_NOT_OPERATIONAL: KindRule(2, 3.0, 3.0, False),

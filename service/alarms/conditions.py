@@ -16,13 +16,14 @@ from loopwright.service.alarms.alarm import RULES, Alarm, AlarmKind
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.listening.heard_node import HeardHeartbeat
-from loopwright.service.states.acceptance_watch import AcceptanceWatch, Trouble, instead_in_words
+from loopwright.service.states.acceptance_watch import AcceptanceWatch, Trouble, TroubleKind, instead_in_words
 from loopwright.service.states.job_state import JobState
-from loopwright.service.states.loop_state import LoopState, same_gains
-from loopwright.service.store.alarms import NOT_RESTORED_TEXT, UnconfirmedJob, alarm_id
+from loopwright.service.states.loop_state import LoopState, loop_state, same_gains
+from loopwright.service.store.alarms import NOT_RESTORED_TEXT, FalsePvJob, UnconfirmedJob, alarm_id
 from loopwright.service.store.live_jobs import Acceptance, JobInBrief
 from loopwright.service.store.watches import AbnormalWatch
 from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Mode as PlanMode
 from loopwright.tuning.reasons import ADVICE, Reason
 
 _NEVER_HEARD_OF_T95 = 0.2
@@ -97,6 +98,7 @@ class AlarmFacts:
     gateways: the other gateways of the database.
     tests: the latest job of each loop of every gateway.
     unconfirmed: tests of every gateway after which the loop was not confirmed to be as before.
+    false_pvs: tests of every gateway that have found PV to be false.
     watches: those after acceptances, of every gateway, that have found something.
     signed: ids of alarms that were signed off, of those in `to_be_asked`.
     """
@@ -108,6 +110,7 @@ class AlarmFacts:
     gateways: Sequence[GatewayFacts] = ()
     tests: Sequence[JobInBrief] = ()
     unconfirmed: Sequence[UnconfirmedJob] = ()
+    false_pvs: Sequence[FalsePvJob] = ()
     watches: Sequence[AbnormalWatch] = ()
     signed: frozenset[str] = frozenset()
 
@@ -147,14 +150,21 @@ def conditions(known: AlarmFacts) -> list[Condition]:
 
 def to_be_asked(known: AlarmFacts) -> set[str]:
     """Returns the ids of the alarms of which it matters here whether they were signed off."""
-    ended = {alarm_id(AlarmKind.NOT_RESTORED, test.id) for test in known.tests if test.state in _NO_ANSWER}
+    ended = {each for test in known.tests if test.state in _NO_ANSWER for each in _of_the_end(test.id)}
     theirs = {alarm.id for gateway in known.gateways for alarm in gateway.alarms if alarm.to_sign}
     return ended | theirs | {each.id for each in conditions(known) if RULES[each.kind].to_sign}
 
 
 def _tests(known: AlarmFacts) -> Iterator[Condition]:
     """What remains of tests that have ended."""
-    unconfirmed = {job.id for job in known.unconfirmed}
+    unconfirmed = {job.id for job in known.unconfirmed} | {job.id for job in known.false_pvs}
+    for found in known.false_pvs:
+        advice = _SEE_THE_JOB if found.reason is None else ADVICE[found.reason]
+        yield Condition(
+            alarm_id(AlarmKind.FALSE_PV, found.id), AlarmKind.FALSE_PV, found.loop, _false_pv(found),
+            f"{advice} No test begins until somebody signs this off.", found.host, found.loop, (found.loop,),
+            f"/jobs/{found.id}", _seconds(found.at),
+        )  # fmt: skip
     for job in known.unconfirmed:
         text = NOT_RESTORED_TEXT
         if job.looked_after:
@@ -170,7 +180,7 @@ def _tests(known: AlarmFacts) -> Iterator[Condition]:
     for test in known.tests:
         if test.state not in _NO_ANSWER or test.id in unconfirmed:
             continue
-        if alarm_id(AlarmKind.NOT_RESTORED, test.id) in known.signed:  # whoever signed that has seen how the test ended
+        if not known.signed.isdisjoint(_of_the_end(test.id)):  # whoever signed that has seen how the test ended
             continue
         how = "failed" if test.state is JobState.FAILED else "was interrupted"
         why = "" if test.reason is None else f": {str(test.reason).replace('_', ' ')}"
@@ -182,6 +192,22 @@ def _tests(known: AlarmFacts) -> Iterator[Condition]:
         )  # fmt: skip
 
 
+def _of_the_end(job_id: str) -> set[str]:
+    """Returns the ids of the alarms that say more of the end of a test than that it failed."""
+    return {alarm_id(kind, job_id) for kind in (AlarmKind.NOT_RESTORED, AlarmKind.FALSE_PV)}
+
+
+def _false_pv(job: FalsePvJob) -> str:
+    """Returns what was found, and what the loop was left in."""
+    found = f"PV was found to be false in a test{': it stood still' if job.reason is Reason.PV_FROZEN else ''}"
+    if job.restored is None:
+        return f"{found}; the loop could not be read back"
+    state = loop_state(job.restored)
+    mode = state.mode.name.lower()
+    at = "" if state.mode is PlanMode.AUTOMATIC else f" at MV {state.held_mv:.6g} %"
+    return f"{found}; the loop was left in {mode}{at}"
+
+
 def _watches(known: AlarmFacts) -> Iterator[Condition]:
     """What was found after acceptances."""
     for each in known.watches:
@@ -189,6 +215,12 @@ def _watches(known: AlarmFacts) -> Iterator[Condition]:
         if trouble is None:
             kind, since_s = AlarmKind.MODEL_MISMATCH, None
             text, advice = _mismatch(each.watch), "Roll the new gains back, or retune the loop. " + _UNTIL_SIGNED
+        elif trouble.kind is TroubleKind.FALSE_PV:
+            kind, since_s, text = AlarmKind.FALSE_PV, _seconds(trouble.at), f"PV is false. {trouble.text}"
+            advice = (
+                "Look at the sensor and the loop now: it is in automatic on this PV unless you put it in manual. "
+                f"Nothing was written to it, and the watch puts no gains back. {_UNTIL_SIGNED}"
+            )
         elif trouble.put_back:
             kind, since_s = AlarmKind.ROLLED_BACK, _seconds(trouble.at)
             text = f"The old gains were put back by the watch: {trouble.text}"

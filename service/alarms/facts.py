@@ -20,7 +20,7 @@ from loopwright.service.listening.listening import Listening
 from loopwright.service.states.job_state import ACTIVE
 from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store import alarms, audit, gateways, watches
-from loopwright.service.store.alarms import UnconfirmedJob
+from loopwright.service.store.alarms import FalsePvJob, UnconfirmedJob
 from loopwright.service.store.live_jobs import Acceptance, JobInBrief, acceptances, latest_tests
 from loopwright.service.store.store import Store
 from loopwright.service.store.watches import AbnormalWatch
@@ -34,6 +34,7 @@ class _Stored:
 
     tests: Mapping[str, JobInBrief] = field(default_factory=dict)
     unconfirmed: Sequence[UnconfirmedJob] = ()
+    false_pvs: Sequence[FalsePvJob] = ()
     watches: Sequence[AbnormalWatch] = ()
     accepted: Mapping[str, Acceptance] = field(default_factory=dict)
     audited: int | None = None
@@ -81,6 +82,7 @@ class FactSource:
             gateways=self._gateways,
             tests=list(self._stored.tests.values()),
             unconfirmed=self._stored.unconfirmed,
+            false_pvs=self._stored.false_pvs,
             watches=self._stored.watches,
         )
         candidates = to_be_asked(known)
@@ -157,6 +159,7 @@ def _asked(store: Store, before: _Stored) -> _Stored:
     return _Stored(
         tests=latest_tests(store),
         unconfirmed=alarms.unconfirmed(store),
+        false_pvs=alarms.false_pvs(store),
         watches=watches.abnormal(store),
         accepted=before.accepted if audited == before.audited else acceptances(store),
         audited=audited,

@@ -10,6 +10,7 @@ from loopwright.service.alarms.conditions import AlarmFacts
 _KNOWN_EVERYWHERE = frozenset(
     {
         AlarmKind.NOT_RESTORED,
+        AlarmKind.FALSE_PV,
         AlarmKind.SUSPECT_GAINS,
         AlarmKind.ROLLED_BACK,
         AlarmKind.MODEL_MISMATCH,

@@ -19,6 +19,7 @@ from loopwright.service.listening.listening import Listening
 from loopwright.service.store import alarms as stored
 from loopwright.service.store.alarms import NOT_RESTORED, SignedOffAlready
 from loopwright.service.store.clock import now
+from loopwright.service.store.false_pv import FALSE_PV
 from loopwright.service.store.tables import AlarmSignOffRow
 
 LOOK_S = 1.0
@@ -146,4 +147,4 @@ def _signed(row: AlarmSignOffRow) -> Alarm:
 
 
 _LEVELS: dict[int, Level] = {level: level for level in LEVELS}
-assert NOT_RESTORED == AlarmKind.NOT_RESTORED
+assert (NOT_RESTORED, FALSE_PV) == (AlarmKind.NOT_RESTORED, AlarmKind.FALSE_PV)

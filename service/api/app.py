@@ -222,6 +222,7 @@ def create_app(
             live_error=away,
             last_heard=None if present is not None else gateways.last_heard(last),
             not_confirmed_home=NotHomeView.of(not_home) if not_home else None,
+            not_acknowledged=jobs.aftercare.not_acknowledged(tag),
             disturbed_by=jobs.directory.disturbed_by(tag),
             knowledge=jobs.knowledge.of(tag, gains),
             watch=None if watched is None else WatchView.of(watched, JobState.ACCEPTED),
@@ -230,7 +231,7 @@ def create_app(
     @app.post(
         "/loops/{tag}/dismiss",
         tags=["loops"],
-        summary="Take responsibility for a loop whose restoration is not confirmed: the service stops checking it",
+        summary="Take responsibility for a loop whose restoration is not confirmed, or whose PV was found to be false",
         responses=problems.responses(404, 409, 422),
     )
     def dismiss_loop(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> DismissedView:

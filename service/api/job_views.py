@@ -199,6 +199,12 @@ class LoopDetail(LoopView):
         "another gateway, what that one has said last. null: the present state is known, or nothing was heard"
     )
     not_confirmed_home: NotHomeView | None = Field(description="The unconfirmed restoration; null: there is none")
+    not_acknowledged: str | None = Field(
+        default=None,
+        description="Which test has found PV to be false, and how that is acknowledged: until then no test begins; "
+        "null: there is none",
+        examples=["job 4f0c2a9be113 found PV of loop TIC-101 to be false, and nobody has acknowledged that: ..."],
+    )
     disturbed_by: str | None = Field(
         description="Which neighbours are under test and may disturb the loop: loops of the same area, and those whose "
         "outer_loop this loop is; null: none",
@@ -214,11 +220,11 @@ class LoopDetail(LoopView):
 
 
 class DismissedView(BaseModel):
-    """The jobs whose unconfirmed restoration of a loop was dismissed."""
+    """The jobs whose unconfirmed restoration of a loop was dismissed, or whose finding of a false PV acknowledged."""
 
     loop: str = Field(examples=["TIC-101"])
     jobs: list[str] = Field(
-        description="URLs of the jobs; empty: every restoration was confirmed", examples=[["/jobs/4f0c2a9be113"]]
+        description="URLs of the jobs; empty: there was nothing to answer for", examples=[["/jobs/4f0c2a9be113"]]
     )
 
 

@@ -23,7 +23,7 @@ from loopwright.service.planning.expected import NOTHING_EXPECTED, Expected
 from loopwright.service.planning.obstacles import Now
 from loopwright.service.planning.preview import FleetPreview, LastProposal, Preview, fleet_preview, preview
 from loopwright.service.states.loop_state import loop_state
-from loopwright.service.store import loop_locks
+from loopwright.service.store import false_pv, loop_locks
 from loopwright.service.store.jobs import Job
 from loopwright.tuning.reasons import Ended, Failed
 
@@ -58,12 +58,17 @@ def router(jobs: Jobs, fleet: Fleet, pool: Pool) -> APIRouter:
     )
     def preview_retunes(request: Annotated[FleetRequest, Body()]) -> FleetPreview:
         options, busy, models = request.each(), jobs.store.busy(), jobs.store.last_models()
-        locked = _locked(jobs)
+        locked, false = _locked(jobs), _not_acknowledged(jobs)
         return fleet_preview([
             preview(
                 config,
                 options,
-                Now(active_job=busy.get(config.tag), locked=locked.get(config.tag), stopping=jobs.stopping),
+                Now(
+                    active_job=busy.get(config.tag),
+                    locked=locked.get(config.tag),
+                    not_acknowledged=false.get(config.tag),
+                    stopping=jobs.stopping,
+                ),
                 _last(models.get(config.tag)),
             )
             for config in fleet.asked(request)
@@ -96,7 +101,12 @@ def _now(jobs: Jobs, tag: str, request: RetuneRequest) -> Now:
     if active is not None and active.found is not None:
         state, locked = loop_state(active.found), _locked(jobs).get(tag)
         return Now(state, active_job=active.id, locked=locked, stopping=jobs.stopping)
-    found = Now(active_job=None if active is None else active.id, locked=_locked(jobs).get(tag), stopping=jobs.stopping)
+    found = Now(
+        active_job=None if active is None else active.id,
+        locked=_locked(jobs).get(tag),
+        not_acknowledged=jobs.aftercare.not_acknowledged(tag),
+        stopping=jobs.stopping,
+    )
     try:
         return replace(found, state=jobs.directory.live(tag))
     except Ended as silent:
@@ -106,6 +116,12 @@ def _now(jobs: Jobs, tag: str, request: RetuneRequest) -> Now:
 def _locked(jobs: Jobs) -> dict[str, str]:
     """The lock of each locked loop in words: by whom, since when and why."""
     return {tag: loop_locks.words(row) for tag, row in jobs.locking.locks().items()}
+
+
+def _not_acknowledged(jobs: Jobs) -> dict[str, str]:
+    """Which test has found PV of a loop to be false, in words, where nobody has acknowledged that."""
+    with jobs.store.reading() as session:
+        return {job.loop: false_pv.words(job) for job in false_pv.not_acknowledged(session)}
 
 
 def _last(row: Job | None) -> LastProposal | None:

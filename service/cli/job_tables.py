@@ -177,6 +177,8 @@ def loop_report(loop: LoopDetail) -> None:
         terminal.console.print(text, highlight=False)
     if loop.not_confirmed_home:
         terminal.console.print(loop.not_confirmed_home.advice, highlight=False)
+    if loop.not_acknowledged:
+        terminal.console.print(loop.not_acknowledged, highlight=False, soft_wrap=True)
 
 
 def knowledge(loop: LoopDetail) -> list[str]:

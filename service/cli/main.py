@@ -483,7 +483,7 @@ def _many(client: Client, started: object, wait: bool, as_json: bool) -> int:
 def dismiss(
     loop: Annotated[str, typer.Argument(help="Tag of the loop.")], url: Url = DEFAULT_URL, as_json: AsJson = False
 ) -> None:
-    """Stop looking after a loop whose restoration after a job was not confirmed."""
+    """Answer for a loop whose restoration after a job was not confirmed, or whose PV a test has found to be false."""
     from loopwright.service.api.job_views import DismissedView
 
     answer = Client(url).post(f"/loops/{loop}/dismiss", {"by": "cli"})

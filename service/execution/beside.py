@@ -94,6 +94,9 @@ class ComputingLoop:
     ) -> LoopState:
         return self._loop.begin(stop, note_session)
 
+    def hold(self) -> None:
+        self._loop.hold()
+
     def restore(self, home: LoopState, session: int | None = None) -> Restored:
         self._over = True  # a computation that runs or waits is not needed any more
         return self._loop.restore(home, session)

@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass
 
 from loopwright.service.states.loop_state import LoopState
+from loopwright.tuning.experiments.false_pv import PvAtRest, PvWatch, check_end_of_rest
 from loopwright.tuning.plan import Sample
-from loopwright.tuning.reasons import Failed, Reason
+from loopwright.tuning.reasons import Failed, FalsePv, Reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,8 +19,8 @@ class RunLimits:
     mv_low, mv_high: limits of MV from the first command on, MV units.
     max_time_s: time budget, s of plant time.
     max_gap_samples: number of samples in a row that may be missing.
-    max_frozen_s: how long PV may stay exactly constant while MV differs from its initial value, s of plant time; longer
-    than any dead time.
+    max_frozen_s: how long a PV of which nothing else is known may stay exactly constant while MV differs from its
+    initial value, s of plant time; longer than any dead time.
     """
 
     pv_low: float = -math.inf
@@ -32,11 +33,15 @@ class RunLimits:
 
 
 class Guard:
-    """Checks each sample against the limits. Commands of an operator or another master are detected by the
+    """Checks each sample against the limits, and against what PV did before the first command: a PV that is false
+    within its limits ends the run as FalsePv. Commands of an operator or another master are detected by the
     controller."""
 
     def __init__(self, limits: RunLimits, state: LoopState) -> None:
-        self._limits = limits
+        self._limits, self._state = limits, state
+        self._at_rest: list[float] = []
+        self._mv_at_rest = state.mv
+        self._watch: PvWatch | None = None
         self._dt = state.sample_time_s
         self._start: float | None = None
         self._last = 0.0
@@ -48,11 +53,13 @@ class Guard:
         self._notable = 1e-3 * abs(state.mv_high - state.mv_low)
 
     def commanded(self) -> None:
-        """Notes that the plan acts on the loop from now on."""
-        self._acting = True
+        """Notes that the plan acts on the loop from now on. Raises FalsePv where PV has ended at rest already."""
+        if not self._acting:
+            self._acting = True
+            check_end_of_rest(self._at_rest)
 
     def check(self, sample: Sample) -> None:
-        """Raises Failed when the sample violates a limit."""
+        """Raises Failed when the sample violates a limit; FalsePv where PV is false within its limits."""
         t, _, pv, mv, _ = sample
         limits = self._limits
         if not (math.isfinite(pv) and math.isfinite(mv)):
@@ -68,9 +75,23 @@ class Guard:
             raise Failed(Reason.MV_LIMIT, f"MV {mv:.5g} left {limits.mv_low:.5g} .. {limits.mv_high:.5g} at {t:.3f} s")
         if t - self._start > limits.max_time_s:
             raise Failed(Reason.TIME_BUDGET, f"{t - self._start:.0f} s of plant time are over the budget")
+        self._check_pv(t, pv, mv)
+
+    def _check_pv(self, t: float, pv: float, mv: float) -> None:
+        """Raises FalsePv."""
+        if not self._acting:
+            self._at_rest.append(pv)
+            self._mv_at_rest = mv
+        else:
+            if self._watch is None:
+                state = self._state
+                rest, direction = PvAtRest.of(self._at_rest), 1.0 if state.reverse_acting else -1.0
+                self._watch = PvWatch(rest, self._mv_at_rest, direction, state.mv_low, state.mv_high)
+                self._at_rest.clear()
+            self._watch.check(pv, mv)
         if pv != self._pv:
             self._frozen_at, self._pv, self._mv = t, pv, mv
         elif abs(mv - self._mv) < self._notable:
             self._frozen_at = t
-        elif t - self._frozen_at > limits.max_frozen_s:
-            raise Failed(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {t - self._frozen_at:.3g} s while MV moved")
+        elif t - self._frozen_at > self._limits.max_frozen_s:
+            raise FalsePv(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {t - self._frozen_at:.3g} s while MV moved")

@@ -75,7 +75,7 @@ class RehearsedLoop:
         self._channel = channel
         self._dt = sample_time_s
         self._n = 0
-        self._home = channel.home
+        self._home, self._held = channel.home, False
         self._pv = plant.pv
 
     def read(self, beside_tests: bool = False) -> LoopState:
@@ -99,7 +99,7 @@ class RehearsedLoop:
         stop: Callable[[], Reason | None] = lambda: None,
         note_session: Callable[[int], None] = lambda session: None,
     ) -> LoopState:
-        self._home = self._channel.home
+        self._home, self._held = self._channel.home, False
         return self.read()
 
     def step(self, commands: Sequence[Command]) -> Sample:
@@ -132,9 +132,14 @@ class RehearsedLoop:
             case SetPvLimits():
                 pass  # the runner alone watches PV in memory
 
+    def hold(self) -> None:
+        self._held = True
+        self._home = self._home.held()
+        self._channel.go_home(self._home)
+
     def restore(self, home: LoopState, session: int | None = None) -> Restored:
         self._channel.go_home(self._home)
-        return Restored(self.read(), "the test is over")
+        return Restored(self.read(), "the test is over", held=self._held)
 
     def accept(self, gains: Gains, instead_of: Gains) -> LoopState:
         self._channel.accept(_parameters(gains))

@@ -1,7 +1,8 @@
 """Runs a plan on a loop, checks every sample, and always restores the loop: the second clause of the safety contract.
 
 Whatever ends the run - the plan's result, a refusal, a limit, a lost node, an operator, a defect - the end is the same:
-the session is closed, the controller restores the loop, and its state is read back.
+the session is closed, the controller restores the loop, and its state is read back. Where PV is false the controller is
+told first to hold the loop in manual.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any, Generic, TypeVar
 
 from loopwright.service.execution.guard import Guard, RunLimits
 from loopwright.service.loops.loop import Loop
-from loopwright.service.states.loop_state import LoopState
+from loopwright.service.states.loop_state import LoopState, after_false_pv
 from loopwright.tuning.plan import (
     Command,
     Event,
@@ -29,7 +30,7 @@ from loopwright.tuning.plan import (
     StageStarted,
     Work,
 )
-from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
+from loopwright.tuning.reasons import Aborted, Ended, Failed, FalsePv, Reason
 
 T = TypeVar("T")
 CHUNK = 200
@@ -104,6 +105,8 @@ class _Run(Generic[T]):
         self._until_something_ends_it()
         self._enter("")
         if self._home is not None:
+            if isinstance(self._result.ended, FalsePv):
+                self._hold()
             self._restore(self._home)
         self._hand_on()
         return self._result
@@ -191,6 +194,14 @@ class _Run(Generic[T]):
     def _when(self) -> str:
         return f"at {self._now:.3f} s of plant time, in stage {self._stage or 'start'}"
 
+    def _hold(self) -> None:
+        """Holds the loop at the MV before the test: no control law may answer a false PV."""
+        self._on_event(Note(f"PV is false: {self._result.ended.detail if self._result.ended else ''}"))
+        try:
+            self._loop.hold()
+        except Ended as ended:
+            self._on_event(Note(f"the loop could not be held: {ended.detail}"))
+
     def _restore(self, home: LoopState) -> None:
         """Restores the loop. A loop whose restoration is not confirmed leaves no proposal."""
         result = self._result
@@ -198,9 +209,12 @@ class _Run(Generic[T]):
             restored = self._loop.restore(home)
         except Ended as ended:
             self._on_event(Note(f"restore: {ended}"))
-            if result.ended is None or result.ended.reason not in (Reason.NODE_LOST, Reason.BUS_LOST):
+            lost = result.ended is not None and result.ended.reason in (Reason.NODE_LOST, Reason.BUS_LOST)
+            if not lost and not isinstance(result.ended, FalsePv):
                 result.value, result.ended = None, ended
         else:
             result.restored = restored.state
+            if isinstance(result.ended, FalsePv):
+                self._on_event(Note(after_false_pv(restored.state)))
             if restored.changed:
                 self._on_event(Note(f"not as before the test, and left so: {'; '.join(restored.changed.values())}"))

@@ -15,7 +15,7 @@ from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.loops.restoration import Restoration, restore_loop_of
 from loopwright.service.states.loop_state import state_json
-from loopwright.service.store import looked_after
+from loopwright.service.store import false_pv, looked_after
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
 from loopwright.service.telemetry.logs import about
@@ -115,10 +115,15 @@ class Aftercare:
         reason = row.reason
         return NotHome(row.loop, row.id, reason, row.detail or "it was not read back")
 
+    def not_acknowledged(self, tag: str) -> str | None:
+        """Returns in words which test of the loop has found PV to be false, where nobody has acknowledged that."""
+        with self._store.reading() as session:
+            return next(map(false_pv.words, false_pv.not_acknowledged(session, tag)), None)
+
     def dismiss(self, tag: str, by: str) -> list[str]:
-        """Ends the supervision of a loop, for which an operator now answers. Returns the jobs for which it was
-        supervised, none when it was not. Raises UnknownLoop, Busy."""
-        if not looked_after.rows(self._store, tag):
+        """Ends the supervision of a loop, for which an operator now answers, and acknowledges that its PV was false.
+        Returns the jobs for which that was so, none when it was not. Raises UnknownLoop, Busy."""
+        if self.not_acknowledged(tag) is None and not looked_after.rows(self._store, tag):
             self._directory.owner(tag)
             return []
         if (busy := self._store.why_busy(tag)) is not None:
@@ -153,7 +158,9 @@ class Aftercare:
             restoration = restore_loop_of(row, self._directory.loops, self._directory.open_loop)
         if restoration.state is None:
             self._not_yet(row, restoration)
-        elif looked_after.home_again(self._store, row.id, state_json(restoration.state), restoration.text):
+        elif looked_after.home_again(
+            self._store, row.id, state_json(restoration.state), restoration.text, restoration.held
+        ):
             log.info("the loop is not supervised any more: %s", restoration.text)
 
     def _not_yet(self, row: Job, restoration: Restoration) -> None:

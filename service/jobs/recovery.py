@@ -21,6 +21,7 @@ from loopwright.tuning.reasons import Reason
 
 log = logging.getLogger(__name__)
 
+FALSE_PV_WORDS = "the test had found PV to be false (the job's events may say how)"
 MAX_ATTEMPTS = 10
 """Number of attempts after which a job is not resumed again."""
 
@@ -53,6 +54,11 @@ class Recovery:
             columns["restored"] = state_json(safe.state)
         elif safe is not None:
             columns["look_after"] = True
+        if safe is not None and safe.held:
+            columns |= {"reason": Reason.BAD_SAMPLE, "false_pv": True}
+            columns["detail"] = f"{FALSE_PV_WORDS}, and was cut off by the end of the service: {_loop_words(safe)}"
+            self.store.move(row.id, JobState.FAILED, **columns)
+            return
         if row.stop_reason is not None:
             columns["reason"] = row.stop_reason
             columns["detail"] = "asked to stop before the service ended; " + _loop_words(safe)

@@ -29,7 +29,7 @@ from loopwright.service.jobs.repeated import Repeated
 from loopwright.service.listening.bins import UNKNOWN_MODE
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.listening.listening import Listening
-from loopwright.service.observing.accepted_operation import accepted_model, compared, oscillation
+from loopwright.service.observing.accepted_operation import accepted_model, compared, false_pv, oscillation
 from loopwright.service.observing.hearing import question
 from loopwright.service.observing.observed import Question
 from loopwright.service.observing.resolution import wall_period_s
@@ -166,7 +166,7 @@ class Watching:
         if known.inside and not watch.inside:  # a service that is started again need not see that for itself
             watch = watches.change(self._store, job_id, partial(_with, inside=True)) or watch
         if text is not None:
-            self._trouble(job, watch, TroubleKind.PV_OUTSIDE_LIMITS, text)
+            self._trouble(job, config, watch, TroubleKind.PV_OUTSIDE_LIMITS, text)
         elif passed_s >= known.due_s:
             self._look_back(job, config, watch, known, now_s)
 
@@ -216,6 +216,10 @@ class Watching:
         left_s = _left_automatic(asked, watch.since_s)
         if left_s is not None:
             watch = self._disarmed(job.id, watch, left_s)
+        false = false_pv(asked, watch.period_s, watch.since_s)
+        if false is not None and false.sure:
+            self._false_pv(job, watch, false.text)
+            return
         found = oscillation(asked, new_gains(job), watch.period_s, watch.since_s)
         if found is not None and watch.trouble is None:
             text = (
@@ -223,7 +227,7 @@ class Watching:
                 f"{found.per_period:.2f} times as large as the one before, {found.peak_to_peak:.3g} {config.pv_unit} "
                 "from peak to peak at last"
             )
-            self._trouble(job, watch, TroubleKind.GROWING_OSCILLATION, text)
+            self._trouble(job, config, watch, TroubleKind.GROWING_OSCILLATION, text)
             return
         self._to_compare[job.id] = asked
         if _complete(watch, (now_s - watch.since_s) / speed):
@@ -270,10 +274,24 @@ class Watching:
 
     # what goes wrong
 
-    def _trouble(self, job: Job, watch: AcceptanceWatch, kind: TroubleKind, text: str) -> None:
-        """Notes what went wrong, and puts the old gains back where that was asked for."""
+    def _false_pv(self, job: Job, watch: AcceptanceWatch, text: str) -> None:
+        """Notes that PV is false. Nothing is written: what such a PV shows is no reason for anything."""
         if watch.trouble is not None:
             return
+        why_not = "what a false PV shows is no reason to change gains"
+        trouble = Trouble(kind=TroubleKind.FALSE_PV, at=now(), text=text, put_back=False, why_not=why_not)
+        if watches.change(self._store, job.id, partial(_with, trouble=trouble)) is not None:
+            log.warning("%s: %s", job.loop, text)
+
+    def _trouble(self, job: Job, config: LoopConfig, watch: AcceptanceWatch, kind: TroubleKind, text: str) -> None:
+        """Notes what went wrong, and puts the old gains back where that was asked for, unless PV is false."""
+        if watch.trouble is not None:
+            return
+        false = false_pv(self._question(job, config, watch), watch.period_s, watch.since_s)
+        if false is not None:
+            if false.sure:
+                self._false_pv(job, watch, false.text)
+            return  # else it is looked at again
         trouble = Trouble(kind=kind, at=now(), text=text)
         noted = watches.change(self._store, job.id, partial(_with, trouble=trouble))
         if noted is None:

@@ -32,6 +32,7 @@ from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.loop_model import loop_model
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.operation import OperationHeard, outdated_by
+from loopwright.service.jobs.recovery import FALSE_PV_WORDS
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
 from loopwright.service.loops.loop import Loop
@@ -42,7 +43,14 @@ from loopwright.service.planning.known_loop import known
 from loopwright.service.planning.t95 import t95_mismatch
 from loopwright.service.results import TransferModelView
 from loopwright.service.states.job_state import ACTIVE, GOOD, IllegalMove, JobState, state_after
-from loopwright.service.states.loop_state import LoopState, differences, loop_state, same_gains, state_json
+from loopwright.service.states.loop_state import (
+    LoopState,
+    after_false_pv,
+    differences,
+    loop_state,
+    same_gains,
+    state_json,
+)
 from loopwright.service.store import looked_after
 from loopwright.service.store.job_rows import NoSuchJob
 from loopwright.service.store.jobs import Job, JobColumns
@@ -53,7 +61,7 @@ from loopwright.tuning.fast.excitation_choice import NOT_ASKED
 from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.plan import Event, Note
-from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
+from loopwright.tuning.reasons import Aborted, Ended, Failed, FalsePv, Reason
 
 log = logging.getLogger(__name__)
 
@@ -229,6 +237,8 @@ class Worker:
         safe = restore_abandoned(loop, loop_state(row.found), row.session)
         if safe.state is None:
             raise Failed(safe.reason or Reason.NODE_LOST, safe.text)
+        if safe.held:
+            raise FalsePv(Reason.BAD_SAMPLE, f"{FALSE_PV_WORDS}: {safe.text}")
         if safe.reason is not None:
             raise Aborted(safe.reason, safe.text)
         self._resumed(row, safe.text)
@@ -299,6 +309,8 @@ class Worker:
         if outcome.ended is not None:
             state = state_after(outcome.ended)
             columns |= {"reason": outcome.ended.reason.value, "detail": outcome.ended.detail}
+            if isinstance(outcome.ended, FalsePv) and not dry_run:
+                columns |= {"false_pv": True, "detail": _with_what_it_left(outcome.ended, outcome.restored)}
         job = self._move(running.job_id, state, **columns)
         self._lasting(lambda: self._operation.outdated(job, events))
         self._knowledge.tested(job, running.pv_range, running.mv_range)
@@ -308,3 +320,9 @@ class Worker:
         else:
             level = logging.INFO if state in GOOD else logging.WARNING
             log.log(level, "job %s, %s: %s", state.value, outcome.ended.reason.value, outcome.ended.detail)
+
+
+def _with_what_it_left(found: FalsePv, restored: LoopState | None) -> str:
+    """Returns how PV was false, and what the loop is since."""
+    left = "how the loop was left is not confirmed" if restored is None else after_false_pv(restored)
+    return f"{found.detail}; {left}"

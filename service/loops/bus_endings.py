@@ -86,7 +86,7 @@ def read_back(reading: BusReading, home: LoopState, number: int, how: str) -> Re
         raise Failed(Reason.NODE_NOT_OPERATIONAL, f"{state.node_state}: nothing controls, MV stays where it is")
     holder = int(tuner.number("controller_session_holder"))
     is_own = bool(number) and int(tuner.number("controller_session_last")) == number and not holder
-    if is_own:  # the controller noted the state at the moment of the opening
+    if is_own:  # the controller noted the state at the moment of the opening, and what HOLD has put in its place
         home = reading.home()
     changes = outside_changes_of(tuner)  # read last, so that it includes every change so far
     differing = differences(state, home)
@@ -106,7 +106,7 @@ def read_back(reading: BusReading, home: LoopState, number: int, how: str) -> Re
         unconfirmed.append(f"MV is {state.mv:.6g} without a valid PV, was {home.mv:.6g}")
     if unconfirmed:
         raise Failed(Reason.RESTORE_UNCONFIRMED, "; ".join(unconfirmed))
-    return Restored(state, how, differing)
+    return Restored(state, how, differing, held=is_own and cause_of(tuner) is Cause.HELD)
 
 
 def _ended_without_pv(tuner: Tuner) -> bool:

@@ -16,7 +16,7 @@ from loopwright.protocol.station import Station
 from loopwright.protocol.tuner import Tuner
 from loopwright.service.loops.bus_connection import BusConnection, Read
 from loopwright.service.loops.bus_reading import BusReading
-from loopwright.service.loops.bus_restore import LOSSY_BUS_S, close_session, end_acceptance, restore
+from loopwright.service.loops.bus_restore import LOSSY_BUS_S, close_session, end_acceptance, hold, restore
 from loopwright.service.loops.bus_samples import BLOCK, MAX_GAP, BusSamples
 from loopwright.service.loops.bus_session import BusSession
 from loopwright.service.loops.loop import Restored
@@ -94,6 +94,7 @@ class BusLoop:
         try:
             with self._connection.tuner() as tuner, tuner.retrying(BEGIN_PATIENCE_S, LOSSY_BUS_S):
                 self._connection.reading(tuner).identify()
+                self._connection.reading(tuner).check_knows(Order.HOLD)
                 self._connection.reading(tuner).compare_times()
                 self._samples.take_plant(tuner)
                 home = self.session.open(tuner, self._samples.pace, self._samples.sample_time_s, note_session)
@@ -121,6 +122,11 @@ class BusLoop:
                 self._commands.clear()
                 self._samples.start_block(tuner)
             return self._samples.next(tuner)
+
+    def hold(self) -> None:
+        if not hold(self._connection, self.session.number):
+            with self._connection.tuner() as tuner:
+                raise self.session.why_over(tuner)
 
     def restore(self, home: LoopState, session: int | None = None) -> Restored:
         try:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from loopwright.protocol.objects import Device, default_of, lookup
-from loopwright.protocol.profile import REVISION, NmtState, OnMissingAnswer, node_name
-from loopwright.protocol.session import GAINS
-from loopwright.protocol.tuner import Tuner, TunerError
+from loopwright.protocol.profile import REVISION, Abort, NmtState, OnMissingAnswer, Order, node_name
+from loopwright.protocol.session import GAINS, object_of
+from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
 from loopwright.service.states.loop_state import OPERATIONAL, LoopState
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
@@ -63,6 +63,16 @@ class BusReading:
                 f"profile, this service {REVISION >> 16}.{REVISION & 0xFFFF}: bring both to the same version",
             )
         self._check_operational(node)
+
+    def check_knows(self, order: Order) -> None:
+        """Checks that the controller knows an order that a test may need. Raises Refused(DEVICE_MISMATCH)."""
+        try:
+            self.tuner.read(object_of(order))
+        except TunerError as error:  # an order can be written only: whatever else is answered, the object is there
+            if error.code == Abort.NO_OBJECT:
+                raise order_unknown(self.controller, order) from error
+            if error.kind is not FailureKind.ABORT:
+                raise
 
     def compare_times(self) -> None:
         """Compares the sample times: with another sample time than the plant's, the gains that a controller shows are
@@ -154,6 +164,15 @@ class BusReading:
             return state, words
         except TunerError:
             return SILENT, ""
+
+
+def order_unknown(node: int, order: Order) -> Refused:
+    """Returns the error for a controller of an older version: the revision counts what was changed, not added."""
+    return Refused(
+        Reason.DEVICE_MISMATCH,
+        f"controller node {node_name(node)} does not know the order {order.name} "
+        f"(object {lookup(object_of(order)).index:04X}h): bring it to the version of this service",
+    )
 
 
 def not_operational(node: int, state: int) -> Failed:

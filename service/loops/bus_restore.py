@@ -1,9 +1,13 @@
-"""The end of a test or an acceptance: it closes the session and reads the loop back."""
+"""The end of a test or an acceptance: it closes the session and reads the loop back. Where PV is false, it has the
+controller hold the loop first."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
+from typing import TypeVar
 
+from loopwright.protocol.profile import Order
 from loopwright.protocol.tuner import Tuner, TunerError
 from loopwright.protocol.tuner_session import TunerSession
 from loopwright.service.loops.bus_connection import AGAIN_S, BusConnection
@@ -11,6 +15,8 @@ from loopwright.service.loops.bus_endings import cause_of, read_back, words_of
 from loopwright.service.loops.loop import Restored
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.reasons import Ended, Failed, Reason
+
+T = TypeVar("T")
 
 RESTORE_PATIENCE_S = 4.0
 """Wall time for which the restoration is retried, and for which a node may leave one of its requests unanswered, s."""
@@ -24,19 +30,39 @@ def restore(connection: BusConnection, home: LoopState, number: int) -> Restored
     number: 0 where no session was opened.
     Raises Failed(RESTORE_UNCONFIRMED | NODE_NOT_OPERATIONAL).
     """
-    station = connection.station
-    give_up = station.monotonic() + RESTORE_PATIENCE_S
-    while True:
+
+    def close_and_read(tuner: Tuner) -> Restored:
+        how = close_session(tuner, number) if number else "no session was opened"
+        return read_back(connection.reading(tuner), home, number, how)
+
+    try:
+        return _patiently(connection, close_and_read)
+    except Ended as ended:
+        if ended.reason is Reason.NODE_NOT_OPERATIONAL:
+            raise
+        raise Failed(Reason.RESTORE_UNCONFIRMED, ended.detail) from ended
+
+
+def hold(connection: BusConnection, number: int) -> bool:
+    """Orders the controller to go to manual at the MV before the test, and to stay there after the session of that
+    number. Returns False where the session is over. Raises Ended."""
+
+    def order(tuner: Tuner) -> bool:
+        if tuner.session:
+            tuner.set_renewed_session(number)  # without a question whether to stop: an abort does not come between
+        if int(tuner.number("controller_session")) != number:
+            return False
+        session = TunerSession(tuner)
+        session.take_up(number)
         try:
-            with connection.tuner() as tuner, tuner.retrying(RESTORE_PATIENCE_S, LOSSY_BUS_S):
-                how = close_session(tuner, number) if number else "no session was opened"
-                return read_back(connection.reading(tuner), home, number, how)
-        except Ended as ended:
-            if station.monotonic() > give_up:
-                if ended.reason is Reason.NODE_NOT_OPERATIONAL:
-                    raise
-                raise Failed(Reason.RESTORE_UNCONFIRMED, ended.detail) from ended
-            station.sleep(AGAIN_S)
+            session.give(Order.HOLD)
+        except TunerError:
+            if session.is_open:
+                raise
+            return False
+        return True
+
+    return _patiently(connection, order)
 
 
 def end_acceptance(connection: BusConnection, number: int, why: Ended | None) -> LoopState:
@@ -45,18 +71,30 @@ def end_acceptance(connection: BusConnection, number: int, why: Ended | None) ->
     why: the error that has interrupted the acceptance, if any. Where the end of the session is not confirmed, it is
     raised with an addition that says so.
     """
+
+    def close_and_read(tuner: Tuner) -> LoopState:
+        close_session(tuner, number)
+        return connection.reading(tuner).state()
+
+    try:
+        return _patiently(connection, close_and_read)
+    except Ended as ended:
+        why = why or ended
+        text = "the end of the session is not confirmed, the controller ends it by itself within seconds"
+        raise type(why)(why.reason, f"{why.detail}; {text}: read the loop before going on") from ended
+
+
+def _patiently(connection: BusConnection, ask: Callable[[Tuner], T]) -> T:
+    """Returns what the controller answers; asks it for RESTORE_PATIENCE_S. Raises the last Ended."""
     station = connection.station
     give_up = station.monotonic() + RESTORE_PATIENCE_S
     while True:
         try:
             with connection.tuner() as tuner, tuner.retrying(RESTORE_PATIENCE_S, LOSSY_BUS_S):
-                close_session(tuner, number)
-                return connection.reading(tuner).state()
-        except Ended as ended:
+                return ask(tuner)
+        except Ended:
             if station.monotonic() > give_up:
-                why = why or ended
-                text = "the end of the session is not confirmed, the controller ends it by itself within seconds"
-                raise type(why)(why.reason, f"{why.detail}; {text}: read the loop before going on") from ended
+                raise
             station.sleep(AGAIN_S)
 
 

@@ -9,13 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from loopwright.protocol.objects import lookup
 from loopwright.protocol.profile import FOREVER, Abort, Order, node_name
-from loopwright.protocol.session import object_of
 from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
 from loopwright.protocol.tuner_session import Lease, TunerSession
 from loopwright.service.loops.bus_connection import AGAIN_S, BusConnection
 from loopwright.service.loops.bus_endings import why_over
+from loopwright.service.loops.bus_reading import order_unknown
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.reasons import Ended, Reason, Refused
 
@@ -142,13 +141,8 @@ class BusSession:
         except TunerError as error:
             if error.code in (Abort.DEVICE_STATE, Abort.INVALID_VALUE) and not self._session.is_open:
                 raise self.why_over(tuner) from error
-            if error.code == Abort.NO_OBJECT:  # of an older version: the revision counts what was changed, not added
-                index = lookup(object_of(order)).index
-                raise Refused(
-                    Reason.DEVICE_MISMATCH,
-                    f"controller node {node_name(self._connection.controller)} does not know the order {order.name} "
-                    f"(object {index:04X}h): bring it to the version of this service",
-                ) from error
+            if error.code == Abort.NO_OBJECT:
+                raise order_unknown(self._connection.controller, order) from error
             raise
 
     def confirm_if_due(self, tuner: Tuner) -> None:

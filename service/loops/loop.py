@@ -18,11 +18,14 @@ class Restored:
 
     how: the end of the test, in words.
     changed: what an operator or another master has changed since the test began: by name, in words.
+    held: whether the test had found PV to be false: a loop that was in automatic is in manual at the MV before the
+    test, except for what is in `changed`.
     """
 
     state: LoopState
     how: str
     changed: Mapping[str, str] = field(default_factory=dict)
+    held: bool = False
 
 
 class Loop(Protocol):
@@ -57,6 +60,15 @@ class Loop(Protocol):
     def step(self, commands: Sequence[Command]) -> Sample:
         """Carries out the commands, then returns the next sample. Raises Failed when node, bus or samples are lost, and
         Aborted when an operator or another master commands the loop."""
+        ...
+
+    def hold(self) -> None:
+        """Moves the loop to the MV before the test at once, and a loop that was in automatic to manual, where it stays
+        after the session, whatever ends it: PV is false. Takes no command afterwards; `restore` follows.
+
+        Raises the reason where the controller does not answer, or the session is over: the loop then is as before the
+        test, but for what an operator or another master has commanded.
+        """
         ...
 
     def restore(self, home: LoopState, session: int | None = None) -> Restored:

@@ -72,6 +72,9 @@ class ObservedLoop:
         self.began_s = began_s
         return sample
 
+    def hold(self) -> None:
+        self._loop.hold()
+
     def restore(self, home: LoopState, session: int | None = None) -> Restored:
         began_s = self._wall()
         restored = self._loop.restore(home, session)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.loops.loop import Loop
-from loopwright.service.states.loop_state import LoopState, loop_state
+from loopwright.service.states.loop_state import LoopState, after_false_pv, loop_state
 from loopwright.service.store.jobs import Job
 from loopwright.tuning.reasons import Ended, Reason
 
@@ -32,11 +32,13 @@ class Restoration:
     state: the loop as read at the end; None when it could not be read, or is not confirmed to be as before the job.
     text: what was done and found, in words.
     reason: why a job on this loop should not go on; None where it may.
+    held: whether the job had found PV to be false, and the controller has held the loop for it.
     """
 
     state: LoopState | None
     text: str
     reason: Reason | None = None
+    held: bool = False
 
 
 def restore_abandoned(loop: Loop, home: LoopState, session: int | None) -> Restoration:
@@ -51,6 +53,11 @@ def restore_abandoned(loop: Loop, home: LoopState, session: int | None) -> Resto
         return Restoration(
             None, f"not confirmed: {ended.detail}; the controller brings it home by itself", ended.reason
         )
+    if restored.held:
+        text = f"{restored.how}; {after_false_pv(restored.state)}"
+        if restored.changed:
+            text += f"; changed meanwhile, and left so: {'; '.join(restored.changed.values())}"
+        return Restoration(restored.state, text, Reason.BAD_SAMPLE, held=True)
     if not restored.changed:
         return Restoration(restored.state, f"{restored.how}: mode, set-point and gains as before the job, read back")
     reason = next((reason for name, reason in _REASONS.items() if name in restored.changed), Reason.SERVICE_STOPPED)

@@ -21,6 +21,7 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.operation.accepted_model import AcceptedModel
 from loopwright.tuning.operation.compared_change import AFTER, compare_change
+from loopwright.tuning.operation.false_pv import FalseOperation, false_operation
 from loopwright.tuning.operation.growing_oscillation import Growing, growing
 from loopwright.tuning.operation.load_changes import load_changes
 from loopwright.tuning.reasons import Ended
@@ -104,6 +105,18 @@ def oscillation(question: Question, gains: Gains, period_s: float, from_s: float
         return None
     stretch, later = heard[-1].stretch, heard[-1].at_s >= from_s
     return growing(replace(stretch, mv=stretch.mv[later], pv=stretch.pv[later], sp=stretch.sp[later]), period_s)
+
+
+def false_pv(question: Question, period_s: float, from_s: float) -> FalseOperation | None:
+    """How PV is false since a time, wall time, s; None where it is not.
+
+    period_s: the ultimate period, s.
+    """
+    heard = question.heard()
+    if not heard or heard[-1].at_s[-1] < from_s:
+        return None
+    stretch = heard[-1].stretch
+    return false_operation(stretch.pv, period_s / stretch.Ts)
 
 
 def under_accepted_gains(heard: Sequence[HeardStretch], gains: Gains) -> list[HeardStretch]:

@@ -59,6 +59,8 @@ class Now:
     silent: why the controller could not be read; None where it answered.
     active_job: the id of the job that has the loop.
     locked: a sentence that says who has locked the loop; None where it is not locked.
+    not_acknowledged: a sentence that says which test has found PV to be false, and how that is acknowledged; None where
+    nothing is to be acknowledged.
     stopping: True while the service shuts down.
     """
 
@@ -66,6 +68,7 @@ class Now:
     silent: Ended | None = None
     active_job: str | None = None
     locked: str | None = None
+    not_acknowledged: str | None = None
     stopping: bool = False
 
 
@@ -83,6 +86,8 @@ def obstacles(config: LoopConfig, request: RetuneRequest, now: Now) -> list[Obst
         found.append(Obstacle(Occupied.BUSY, f"loop {config.tag} is busy with job {now.active_job}"))
     if now.locked is not None:
         found.append(Obstacle(Reason.LOCKED, now.locked))
+    if now.not_acknowledged is not None:
+        found.append(Obstacle(Reason.NOT_ACKNOWLEDGED, now.not_acknowledged))
     try:
         check_setpoint_source(narrowed, request, None if now.state is None else now.state.mode)
     except RemoteSetpoint as remote:

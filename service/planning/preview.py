@@ -319,7 +319,17 @@ def _on_abort(request: RetuneRequest, state: LoopState | None, unit: str, ramped
         silent = f" If the controller itself falls silent, the plant's I/O {state.when_silent}."
     by_itself = "The controller does that by itself also when the service or the bus fails."
     at_once = " Where a test is cut short the set-point goes home at once, not by a ramp." if ramped else ""
-    return f"{_home(state, unit)} {by_itself}{at_once}{silent}"
+    return f"{_home(state, unit)} {by_itself}{at_once}{_on_false_pv(state)}{silent}"
+
+
+def _on_false_pv(state: LoopState | None) -> str:
+    """Returns what becomes of a loop in automatic whose PV is found to be false; "" where it is as after an abort."""
+    if state is not None and state.mode is not Mode.AUTOMATIC:
+        return ""
+    return (
+        " Where PV is found to be false (it stands still, or jumps, as the plant cannot) the controller is in manual "
+        "at the MV of before instead, until an operator acts."
+    )
 
 
 def _home(state: LoopState | None, unit: str) -> str:

@@ -29,10 +29,11 @@ class WatchEnd(StrEnum):
 
 
 class TroubleKind(StrEnum):
-    """Why the old gains are to be put back."""
+    """What goes wrong. For a false PV no gains are put back: nothing is to be done by what it shows."""
 
     PV_OUTSIDE_LIMITS = "pv_outside_limits"
     GROWING_OSCILLATION = "growing_oscillation"
+    FALSE_PV = "false_pv"
 
 
 class _Kept(BaseModel):

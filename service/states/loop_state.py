@@ -39,6 +39,11 @@ class LoopState:
     node_state: str = OPERATIONAL
     when_silent: str = ""
 
+    @property
+    def held_mv(self) -> float:
+        """Returns the MV that the loop has, or is on its way to, where no control law moves it, MV units."""
+        return self.manual_output if self.mode is Mode.MANUAL else self.mv
+
 
 def differences(state: LoopState, home: LoopState) -> dict[str, str]:
     """In what the loop is not as it was, each in words."""
@@ -52,6 +57,16 @@ def differences(state: LoopState, home: LoopState) -> dict[str, str]:
     if home.mode is Mode.MANUAL and not same(state.manual_output, home.manual_output):
         found["output"] = f"manual output is {state.manual_output:.6g}, was {home.manual_output:.6g}"
     return found
+
+
+def after_false_pv(state: LoopState) -> str:
+    """Returns in words what a loop is after a test that has found PV to be false, and who has to act."""
+    if state.mode is Mode.AUTOMATIC:
+        return "PV is false, and the loop is in automatic: an operator has to look at it now, and to put it in manual"
+    return (
+        f"PV is false: the loop is in {state.mode.name.lower()} at MV {state.held_mv:.6g}, and nothing controls PV "
+        "until an operator has mended the sensor and puts the loop in automatic"
+    )
 
 
 def same_gains(one: Gains, other: Gains) -> bool:

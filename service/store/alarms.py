@@ -10,8 +10,10 @@ from sqlalchemy import func, or_, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
+from loopwright.service.jsonable import JsonObject
 from loopwright.service.store import audit, claims
 from loopwright.service.store.clock import now
+from loopwright.service.store.false_pv import FALSE_PV, not_acknowledged
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import AlarmSignOffRow, JobRow
 from loopwright.tuning.reasons import Reason
@@ -19,6 +21,7 @@ from loopwright.tuning.reasons import Reason
 NOT_RESTORED = "not_restored"
 """The kind of the alarm that a loop is not confirmed to be as before a test."""
 NOT_RESTORED_TEXT = "Not confirmed that the loop is as before the test"
+_TEXTS = {NOT_RESTORED: NOT_RESTORED_TEXT, FALSE_PV: "The test found PV to be false"}
 
 
 class SignedOffAlready(Exception):
@@ -26,6 +29,22 @@ class SignedOffAlready(Exception):
 
     def __init__(self, row: AlarmSignOffRow) -> None:
         super().__init__(f"alarm {row.alarm_id} was signed off by {row.by} at {row.at}: {row.text}")
+
+
+@dataclass(frozen=True, slots=True)
+class FalsePvJob:
+    """A test that has found PV to be false, which nobody has signed off.
+
+    at: when it ended: UTC, ISO 8601.
+    restored: the loop as read back; None: it was not.
+    """
+
+    id: str
+    loop: str
+    host: str
+    at: str
+    reason: Reason | None
+    restored: JsonObject | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +89,15 @@ def unconfirmed(store: Store) -> list[UnconfirmedJob]:
         return [UnconfirmedJob(*row) for row in session.execute(wanted)]
 
 
+def false_pvs(store: Store) -> list[FalsePvJob]:
+    """Returns those of every host, oldest first. Raises SQLAlchemyError."""
+    with store.reading() as session:
+        return [
+            FalsePvJob(job.id, job.loop, job.host, job.ended_at or job.created_at, job.reason, job.restored)
+            for job in not_acknowledged(session)
+        ]
+
+
 def signed_off(store: Store, alarms: Collection[str]) -> frozenset[str]:
     """Returns which of these alarms were signed off. Raises SQLAlchemyError."""
     with store.reading() as session:
@@ -100,15 +128,18 @@ def sign_off(store: Store, row: AlarmSignOffRow) -> AlarmSignOffRow:
     return row
 
 
-def restoration_signed_off(session: Session, job: JobRow, by: str) -> None:
-    """Signs the restoration off within a transaction in which a person answers for the loop, unless it was before."""
-    of_it = select(AlarmSignOffRow).where(AlarmSignOffRow.job_id == job.id, AlarmSignOffRow.kind == NOT_RESTORED)
+def signed_off_with(session: Session, job: JobRow, kind: str, by: str) -> None:
+    """Signs an alarm off within a transaction in which a person answers for the loop, unless it was before.
+
+    kind: NOT_RESTORED, FALSE_PV.
+    """
+    of_it = select(AlarmSignOffRow).where(AlarmSignOffRow.job_id == job.id, AlarmSignOffRow.kind == kind)
     if session.scalars(of_it).first() is None:
         _add(
             session,
             AlarmSignOffRow(
-                alarm_id=alarm_id(NOT_RESTORED, job.id), level=1, kind=NOT_RESTORED, host=job.host, loop=job.loop,
-                job_id=job.id, text=NOT_RESTORED_TEXT, since=job.ended_at or job.created_at, by=by, at=now(),
+                alarm_id=alarm_id(kind, job.id), level=1, kind=kind, host=job.host, loop=job.loop, job_id=job.id,
+                text=_TEXTS[kind], since=job.ended_at or job.created_at, by=by, at=now(),
             ),
         )  # fmt: skip
 

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from loopwright.service.jsonable import JsonObject, json_object, to_jsonable
 from loopwright.service.states.job_state import ACTIVE, MOVES, JobState, shown
 from loopwright.service.states.loop_state import gains_of, same_gains
-from loopwright.service.store import audit, claims, late, loop_locks
+from loopwright.service.store import audit, claims, false_pv, late, loop_locks
 from loopwright.service.store.clock import now
 from loopwright.service.store.jobs import JobColumns
 from loopwright.service.store.tables import ChunkRow, EventRow, JobRow
@@ -62,9 +62,10 @@ def check(session: Session, row: JobRow, wanted: JobState) -> None:
 
 
 def may_begin(session: Session, row: JobRow) -> None:
-    """Raises Locked."""
+    """Raises Locked, NotAcknowledged."""
     if not row.dry_run:
         loop_locks.check(session, row.loop)
+        false_pv.check(session, row.loop)
 
 
 def move(session: Session, row: JobRow, wanted: JobState, by: str, columns: JobColumns) -> JobRow:

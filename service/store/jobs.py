@@ -23,6 +23,7 @@ class JobColumns(TypedDict, total=False):
 
     attempt: int
     detail: str
+    false_pv: bool
     found: Mapping[str, object]
     look_after: bool
     old_gains: Mapping[str, object]
@@ -67,6 +68,7 @@ class Job:
     found: JsonObject | None
     session: int | None
     look_after: bool
+    false_pv: bool
     stop_reason: Reason | None
 
     @classmethod

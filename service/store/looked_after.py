@@ -11,7 +11,7 @@ from sqlalchemy import distinct, func, select
 from sqlalchemy.orm import Session
 
 from loopwright.service.jsonable import json_object
-from loopwright.service.store import alarms, audit
+from loopwright.service.store import alarms, audit, false_pv
 from loopwright.service.store.job_rows import append, set_columns
 from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.journal_writes import Write
@@ -34,14 +34,16 @@ def count(session: Session, host: str) -> int:
     return session.scalar(wanted) or 0
 
 
-def home_again(store: Store, job_id: str, restored: Mapping[str, object], text: str) -> bool:
-    """The loop was read back. False when somebody else was faster to end it."""
+def home_again(store: Store, job_id: str, restored: Mapping[str, object], text: str, held: bool = False) -> bool:
+    """The loop was read back. False when somebody else was faster to end it.
+
+    held: whether it is held in manual, because its PV was found to be false."""
     with store.writing() as session:
         wanted = select(JobRow).where(JobRow.id == job_id, JobRow.look_after.is_(True)).with_for_update()
         row = session.scalars(wanted).one_or_none()
         if row is None:
             return False
-        row.look_after, row.restored = False, json_object(restored)
+        row.look_after, row.restored, row.false_pv = False, json_object(restored), row.false_pv or held
         append(session, row.id, "loop_found", {"text": text}, row.plant_time_s)
         return True
 
@@ -63,16 +65,21 @@ def opened(job_id: str, columns: JobColumns) -> Write:
 
 
 def dismissed(store: Store, loop: str, by: str) -> list[str]:
-    """A person answers for the loop. Returns the ids of the jobs it was looked after for."""
+    """A person answers for the loop. Returns the ids of the jobs it was looked after for, or that had found its PV to
+    be false."""
     with store.writing() as session:
-        found = _of_loop(session, loop)
-        for row in found:
-            row.look_after = False
+        false = false_pv.not_acknowledged(session, loop)
+        found = {row.id: row for row in (*_of_loop(session, loop), *false)}
+        for row in found.values():
+            before = {"look_after": row.look_after, "reason": row.reason}
             append(session, row.id, "dismissed", {"by": by}, row.plant_time_s)
-            before = {"look_after": True, "reason": row.reason}
             audit.record(session, "dismiss", row.id, before=before, after={"look_after": False}, loop=loop, said_by=by)
-            alarms.restoration_signed_off(session, row, by)
-        return [row.id for row in found]
+            if row.look_after:
+                row.look_after = False
+                alarms.signed_off_with(session, row, alarms.NOT_RESTORED, by)
+            if row in false:
+                alarms.signed_off_with(session, row, false_pv.FALSE_PV, by)
+        return list(found)
 
 
 def _of_loop(session: Session, loop: str) -> Sequence[JobRow]:

@@ -39,7 +39,7 @@ OPEN = (RetuneState.RUNNING, RetuneState.STOPPING)
 WAITING, SKIPPED = "waiting", "skipped"
 _FAILURES = frozenset({JobState.REFUSED, JobState.FAILED, JobState.INTERRUPTED})
 _NOBODYS_FAULT = frozenset({Reason.OPERATOR.value, Reason.SERVICE_STOPPED.value})
-_LOCKED = Reason.LOCKED.value
+_CLOSED = (Reason.LOCKED.value, Reason.NOT_ACKNOWLEDGED.value)
 
 
 class NoSuchRetune(Exception):
@@ -83,9 +83,9 @@ class Part:
 
     @property
     def failed(self) -> bool:
-        """Ended without an answer, and not because somebody or the end of the service stopped it, or because the loop
-        is locked."""
-        if self.reason == _LOCKED:
+        """Ended without an answer, and not because somebody or the end of the service stopped it, or because no test
+        may begin on the loop."""
+        if self.reason in _CLOSED:
             return False
         if self.given_up:
             return True

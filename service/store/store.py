@@ -212,7 +212,8 @@ class Store:
         version: str = "0",
         also: WithJob | None = None,
     ) -> Job:
-        """A new queued job, on this host unless on another. Raises Busy when the loop has an active one, and Locked."""
+        """A new queued job, on this host unless on another. Raises Busy when the loop has an active one, and Locked,
+        NotAcknowledged."""
         row = JobRow(
             id=secrets.token_hex(6),
             loop=loop,
@@ -226,8 +227,7 @@ class Store:
         )
         try:
             with self.writing() as session:
-                if not dry_run:
-                    loop_locks.check(session, loop)
+                job_rows.may_begin(session, row)
                 session.add(row)
                 session.flush()
                 job_rows.append(session, row.id, "state", {"state": row.state, "by": requested_by}, 0.0)

@@ -103,6 +103,7 @@ class JobRow(Base):
         Index("jobs_by_host", "host", "state"),
         Index("jobs_by_reason", "reason"),
         Index("jobs_looked_after", "look_after"),
+        Index("jobs_false_pv", "false_pv"),
     )
 
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
@@ -133,6 +134,8 @@ class JobRow(Base):
     session: Mapped[int | None] = mapped_column(BigInteger)
     # The loop was not read back as home: it is looked at until it is, or a person says otherwise.
     look_after: Mapped[bool] = mapped_column(server_default=text("false"), default=False)
+    # The test has found PV to be false: no other begins on the loop until its alarm is signed off.
+    false_pv: Mapped[bool] = mapped_column(server_default=text("false"), default=False)
     # Why the job is to stop, once somebody wants it to: any host may write it, the job's own host acts.
     stop_reason: Mapped[Reason | None] = mapped_column(EnumColumn(Reason))
 

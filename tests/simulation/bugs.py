@@ -8,10 +8,11 @@ from typing import Any
 from loopwright.controller import session
 from loopwright.controller.channel import Channel, Home
 from loopwright.protocol.objects import Value
-from loopwright.protocol.profile import Mode, Order, RelayState
+from loopwright.protocol.profile import Cause, Mode, Order, RelayState
 from loopwright.protocol.session import check_of as check_of_order
+from loopwright.protocol.tuner import Tuner
 from loopwright.service.jobs import decisions, watching
-from loopwright.service.loops import bus_loop, gain_change
+from loopwright.service.loops import bus_endings, bus_loop, gain_change
 
 Replace = Callable[[Any, str, Any], None]
 
@@ -62,6 +63,26 @@ def manual_output_stays(replace: Replace) -> None:
     replace(Channel, "go_home", goes_home)
 
 
+def hold_keeps_automatic(replace: Replace) -> None:
+    """HOLD goes home at once, and leaves home in automatic."""
+
+    def held(self: Home) -> Home:
+        return self
+
+    replace(Home, "held", held)
+
+
+def hold_is_not_looked_for(replace: Replace) -> None:
+    """Whoever reads a loop back takes one that is held for one that has come home as ever."""
+    real = bus_endings.cause_of
+
+    def cause_of(tuner: Tuner) -> Cause:
+        cause = real(tuner)
+        return Cause.CLOSED if cause is Cause.HELD else cause
+
+    replace(bus_endings, "cause_of", cause_of)
+
+
 def gains_are_not_compared(replace: Replace) -> None:
     """The watch after acceptance puts the old gains back whatever the controller holds."""
 
@@ -76,5 +97,7 @@ BUGS: dict[str, Callable[[Replace], None]] = {
     "count-is-not-checked": count_is_not_checked,
     "set-point-stays": set_point_stays,
     "manual-output-stays": manual_output_stays,
+    "hold-keeps-automatic": hold_keeps_automatic,
+    "hold-is-not-looked-for": hold_is_not_looked_for,
     "gains-are-not-compared": gains_are_not_compared,
 }

@@ -271,10 +271,20 @@ class Pv:
 
 
 class Sensor:
-    """shows: what a broken one shows; None: PV."""
+    """shows: what a broken one shows; None: PV.  was_false: whether it was ever broken."""
 
     def __init__(self) -> None:
-        self.shows: float | None = None
+        self._shows: float | None = None
+        self.was_false = False
+
+    @property
+    def shows(self) -> float | None:
+        return self._shows
+
+    @shows.setter
+    def shows(self, value: float | None) -> None:
+        self._shows = value
+        self.was_false |= value is not None
 
 
 class PlantNode(Node):

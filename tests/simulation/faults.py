@@ -62,14 +62,14 @@ def killed(world: World, gateway: Gateway, times: int | None = None, never: floa
 
 def killed_at(world: World, gateway: Gateway, at_s: float, back_s: float | None) -> None:
     """From outside, at a time, also while it waits."""
-
-    def now() -> None:
-        if gateway.process is not None and gateway.process.alive:
-            gateway.restart_after = lambda: back_s
-            gateway.process.kill()
-
     world.trouble(at_s)
-    world.simulation.after(at_s, now)
+    world.simulation.after(at_s, _kill, gateway, back_s)
+
+
+def _kill(gateway: Gateway, back_s: float | None) -> None:
+    if gateway.process is not None and gateway.process.alive:
+        gateway.restart_after = lambda: back_s
+        gateway.process.kill()
 
 
 def told_to_end(world: World, gateway: Gateway, at_s: float) -> None:
@@ -393,6 +393,66 @@ def no_pv(world: World) -> None:
     if world.random.random() < 0.4:
         frames(world)
     maybe_killed(world, gateway, 0.2)
+
+
+def false_pv(world: World) -> None:
+    """PV becomes false within its limits, the job finds that out, and one of all that happens about then."""
+    random, simulation, sensor = world.random, world.simulation, world.plant.sensor
+    at = moment(world)
+    stays_s = random.choice((math.inf, math.inf, math.inf, 3.0, 12.0 * world.loop.wall_s))
+    shown = random.choice((None, 35.0, 62.5))
+
+    def begin() -> None:
+        simulation.note("sensor", "PV is false")
+        present = world.plant.device.plants[0].pv if shown is None and world.plant.is_on else shown or 50.0
+        sensor.shows = struct.unpack("<f", struct.pack("<f", min(max(present, 25.0), 75.0)))[0]
+
+    def over() -> None:
+        simulation.note("sensor", "PV is true")
+        sensor.shows = None
+
+    world.tune = plans.tunes(world.actions, lambda: sensor.shows is not None)
+    simulation.after(at, begin)
+    found = at + (plans.FALSE_SAMPLES + 2) * world.loop.wall_s
+    world.trouble(found)
+    if math.isfinite(stays_s):
+        simulation.after(at + stays_s, over)
+        world.trouble(at + stays_s)
+    gateway = one_job(world, abort_s=person_aborts(world))
+    what = random.choice(
+        (None, "kills", "kills", "killed", "killed held", "killed held", "frames", "away", "stalls", "restarts",
+         "power", "nmt", "operator", "operator", "operator", "stranger", "pv", "term")
+    )  # fmt: skip
+    match what:
+        case "kills":
+            killed(world, gateway)
+        case "killed":
+            killed_at(world, gateway, random.uniform(at, found + 0.3), random.choice((None, *RESTARTS_S)))
+        case "killed held":
+            after_s, back_s = random.choice((0.0, 0.001, 0.005, 0.03, 0.1)), random.choice((None, *RESTARTS_S))
+            world.invariants.on_hold = lambda: simulation.after(after_s, _kill, gateway, back_s)
+        case "frames":
+            frames(world)
+        case "away":
+            away(world)
+        case "stalls":
+            stalls(world, gateway)
+        case "restarts":
+            restarts(world)
+        case "power":
+            power(world)
+        case "nmt":
+            nmt(world)
+        case "operator":
+            Operator(world, sorted(random.uniform(at, found + 2.0) for _ in range(random.randint(1, 3))), random)
+        case "stranger":
+            stranger(world)
+        case "pv":
+            pv_gone(world)
+        case "term":
+            told_to_end(world, gateway, random.uniform(at, found + 0.5))
+    if what not in ("kills", "killed", "killed held"):
+        maybe_killed(world, gateway, 0.2)
 
 
 def strangers(world: World) -> None:

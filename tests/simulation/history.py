@@ -275,6 +275,8 @@ class World:
             gateway.store.on_statement = gateway.store.after_move = None
             for row in gateway.rows():
                 ending.jobs.append((row.state, row.reason or ""))
+            if gateway.is_up:
+                self.invariants.held_jobs(gateway.store.seen())
         ending.bad = self.invariants.bad
         ending.simulated_s = simulation.now - START
         ending.events = simulation.events

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -95,6 +95,9 @@ class Invariants:
     held: list[Held] = field(default_factory=list)
     hands: list[tuple[float, str]] = field(default_factory=list)
     readings: dict[int, tuple[LoopState, float, float]] = field(default_factory=dict)
+    holds: set[int] = field(default_factory=set)
+    """The sessions in which HOLD was put in force."""
+    on_hold: Callable[[], object] = lambda: None
     a_defect_is_put_in: bool = False
 
     def __post_init__(self) -> None:
@@ -119,6 +122,8 @@ class Invariants:
         self._goes_on_from = 0.0
         """The output from which the next law, or a hand's MANUAL, goes on."""
         self._in_force: set[tuple[int, str, Value]] = set()
+        self._home_mv = 0.0
+        """Noted at the opening of the session."""
 
     # -- telling
 
@@ -158,6 +163,8 @@ class Invariants:
             if order in self._in_force:
                 self.say(f"put in force twice: {name} {value:08X}h")
             self._in_force.add(order)
+            if name == "controller_order_hold":
+                self._on_hold(session)
         number = float(value) if not isinstance(value, str) else math.nan
         if name == "controller_setpoint":
             self._change(sp=number)
@@ -190,6 +197,16 @@ class Invariants:
                 self.say(f"accepted without a person: {channel.accepted}")
             self._change(accepted=channel.accepted)
             self.hands.append((self.simulation.now, "gains"))
+
+    def _on_hold(self, session: Session) -> None:
+        """What is chosen from now on, unless somebody's hand chooses otherwise."""
+        self.holds.add(session.number)
+        self.on_hold()
+        if not self.plant.sensor.was_false:
+            self.say("HOLD under a true sensor")
+        if self.truth.mode is Mode.AUTOMATIC:
+            self._change(mode=Mode.MANUAL, output=self._home_mv)
+        self.simulation.note("truth", f"HOLD; {self.words()}")
 
     def _on_command(self, data: bytes, do: Callable[[bytes], None]) -> None:
         session = self.controller.device.sessions[0]
@@ -296,6 +313,9 @@ class Invariants:
         if session.is_open:
             if last is None or last.session != session.number:
                 self._open = session.number, self.simulation.now
+                self._home_mv = session.home.mv
+                if self.holds and not any(kind == "restart" for _, kind in self.hands):
+                    self.say("a test begins on a loop whose PV was found to be false")
                 words = f"session {session.number:08X}h of {session.holder:02X}h opens"
                 self.simulation.note(self.controller.name, words)
             home = session.home
@@ -418,6 +438,17 @@ class Invariants:
             self.say(f"the job says what the controller did not hold: {', '.join(wrong)}; it held {window[-1]}")
         if session and all(each.session == session for each in window):
             self.say("the job says restored while its session was open")
+
+    def held_jobs(self, rows: Sequence[Job]) -> None:
+        """The rows of a gateway that is up at the end: a job that has had its loop held says so, and no other does."""
+        restarted = any(kind == "restart" for _, kind in self.hands)
+        for row in rows:
+            if row.session in self.holds and not (row.false_pv or row.look_after or restarted):
+                self.say(f"the loop was held, and its job does not say so: {row.state} {row.reason} {row.detail}")
+            if row.false_pv and not self.plant.sensor.was_false:
+                self.say(f"a job says that PV was false, and it was not: {row.detail}")
+            if row.false_pv and row.state is not JobState.FAILED and row.state is not JobState.INTERRUPTED:
+                self.say(f"a job that has found PV to be false is: {row.state}")
 
     # -- the end
 

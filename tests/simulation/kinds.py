@@ -23,7 +23,8 @@ class Kind:
 
 KINDS: dict[str, Kind] = {
     "calm": Kind("nothing goes wrong, or a person aborts", 2, faults.calm),
-    "kills": Kind("the service is killed 1 to 3 times before any call, in recovery too", 15, faults.kills),
+    "kills": Kind("the service is killed 1 to 3 times before any call, in recovery too", 12, faults.kills),
+    "false_pv": Kind("PV false within its limits: still, or elsewhere; and one of all that", 3, faults.false_pv),
     "frames": Kind("frames lost, doubled, late; kills", 6, faults.bad_frames),
     "away": Kind("the bus away, holding frames back, or its interface down; kills", 7, faults.bus_away),
     "held": Kind("the service dies while its frames are held back", 6, faults.held),

@@ -31,9 +31,10 @@ from loopwright.tuning.plan import (
     StageStarted,
     Work,
 )
-from loopwright.tuning.reasons import Reason, Refused
+from loopwright.tuning.reasons import FalsePv, Reason, Refused
 
 PROPOSED = Gains(0.75, 8.0, 0.0, 0.0, 0.5, 0.0)
+FALSE_SAMPLES = 5
 TRIED = Gains(1.25, 4.0, 0.0, 0.0, 1.0, 0.0)
 
 
@@ -119,14 +120,29 @@ def made_up(actions: tuple[Action, ...], state: LoopState) -> Plan[Made]:
     return Made(PROPOSED)
 
 
-def tunes(actions: tuple[Action, ...]) -> Tune:
-    """The work of a job with that plan."""
+def finding_false_pv(plan: Plan[Made], is_false: Callable[[], bool]) -> Plan[Made]:
+    """The plan, which finds PV to be false where it has been so for FALSE_SAMPLES samples."""
+    answer, run = next(plan), 0
+    while True:
+        sample = yield answer
+        run = run + 1 if is_false() else 0
+        if run >= FALSE_SAMPLES:
+            raise FalsePv(Reason.PV_FROZEN, f"PV is {sample.pv:g} and false")
+        try:
+            answer = plan.send(sample)
+        except StopIteration as end:
+            made: Made = end.value
+            return made
+
+
+def tunes(actions: tuple[Action, ...], is_false: Callable[[], bool] = lambda: False) -> Tune:
+    """The work of a job with that plan. is_false: whether PV is, as the job finds out."""
 
     def work(config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
         limits = RunLimits(config.pv_limits.low, config.pv_limits.high, max_time_s=1e9)
         ran = run(
-            made_up(actions, state), loop, limits=limits, on_event=hooks.on_event, on_samples=hooks.on_samples,
-            stop=hooks.stop, note_session=hooks.note_session, on_home=hooks.on_home,
+            finding_false_pv(made_up(actions, state), is_false), loop, limits=limits, on_event=hooks.on_event,
+            on_samples=hooks.on_samples, stop=hooks.stop, note_session=hooks.note_session, on_home=hooks.on_home,
         )  # fmt: skip
         made = None
         if ran.value is not None:

@@ -29,7 +29,7 @@ ORDERS: dict[Order, Sequence[float]] = {
     Order.ACCEPT: TRIED,
     Order.WATCH: (0.0, 100.0),
 }
-"""Every order that a session takes but the last, with values that make a difference."""
+"""Every order that a session takes but the last ones, CLOSE and HOLD, with values that make a difference."""
 HOMES = pytest.mark.parametrize("mode", [Mode.OFF, Mode.MANUAL, Mode.AUTOMATIC], ids=lambda mode: mode.name.lower())
 
 
@@ -128,6 +128,7 @@ class Bench:
         assert (session.is_open, session.last, session.cause) == (False, opened, cause)
 
 
-CAUSES = [cause for cause in Cause if cause is not Cause.NONE]
+CAUSES = [cause for cause in Cause if cause not in (Cause.NONE, Cause.HELD)]
+"""The ends of a session that need no order HOLD before."""
 WITHOUT_PV = (Cause.NMT, Cause.NO_PV)
 NO_NUMBERS = (math.nan, math.inf, 1e30)

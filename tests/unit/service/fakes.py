@@ -37,7 +37,7 @@ from loopwright.tuning.analysis.comparison import Predicted
 from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Mode, Note, Sample, SetGains, SetSetpoint, StageDone, StageStarted
-from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason, Refused
+from loopwright.tuning.reasons import Aborted, Ended, Failed, FalsePv, Reason, Refused
 from tests.unit.service.processes import PATIENCE_S, until
 
 OLD, NEW = Gains(0.5, 2.0), Gains(0.75, 3.0)
@@ -63,6 +63,7 @@ class FakeController:
         self.session = 0
         self.session_last = 0
         self.hands: set[str] = set()
+        self.held = False
 
     def answer(self) -> LoopState:
         if self.absent:
@@ -71,6 +72,14 @@ class FakeController:
 
     def begin_session(self, number: int) -> None:
         self.home, self.session, self.session_last, self.hands = self.state, number, number, set()
+        self.held = False
+
+    def hold(self) -> None:
+        """The order HOLD."""
+        if not self.session:
+            raise Failed(Reason.DEVICE_WENT_BACK, "the controller ended the test by itself")
+        self.home, self.held = replace(self.home, mode=Mode.MANUAL, manual_output=self.home.mv), True
+        self.state = self.home
 
     def end_session(self) -> None:
         """As the controller does by itself, whatever ended it."""
@@ -125,6 +134,9 @@ class FakeLoop:
         state = self._controller.state
         return Sample(0.1 * self._n, state.sp, state.pv, state.mv, int(state.mode))
 
+    def hold(self) -> None:
+        self._controller.hold()
+
     def restore(self, home: LoopState, session: int | None = None) -> Restored:
         controller, number = self._controller, self._number if session is None else session
         self._operational(self.read())
@@ -139,7 +151,7 @@ class FakeLoop:
         found = differences(controller.state, controller.home)
         if found.keys() - controller.hands:
             raise Failed(Reason.RESTORE_UNCONFIRMED, "; ".join(found.values()))
-        return Restored(controller.state, how, found)
+        return Restored(controller.state, how, found, held=controller.held)
 
     @staticmethod
     def _operational(state: LoopState) -> None:
@@ -232,6 +244,8 @@ class FakeTune:
         except Ended as error:
             ended = error
         try:
+            if isinstance(ended, FalsePv):
+                loop.hold()
             restored = loop.restore(state).state
         except Ended as error:
             ended = error

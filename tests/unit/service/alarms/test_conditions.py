@@ -17,8 +17,9 @@ from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.listening.heard_node import HeardHeartbeat
 from loopwright.service.states.job_state import JobState
-from loopwright.service.states.loop_state import LoopState
-from loopwright.service.store.alarms import NOT_RESTORED, UnconfirmedJob, alarm_id
+from loopwright.service.states.loop_state import LoopState, state_json
+from loopwright.service.store.alarms import NOT_RESTORED, FalsePvJob, UnconfirmedJob, alarm_id
+from loopwright.service.store.false_pv import FALSE_PV
 from loopwright.service.store.live_jobs import Acceptance, JobInBrief
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
@@ -76,6 +77,26 @@ def unconfirmed(**changes: object) -> UnconfirmedJob:
     return replace(found, **changes)
 
 
+@pytest.mark.parametrize(
+    ("mode", "words"),
+    [
+        (Mode.MANUAL, "it stood still; the loop was left in manual at MV 42.5 %"),
+        (Mode.AUTOMATIC, "it stood still; the loop was left in automatic"),
+        (None, "it stood still; the loop could not be read back"),
+    ],
+)
+def test_a_false_pv_is_an_alarm_at_once_which_says_what_the_loop_was_left_in(mode: Mode | None, words: str) -> None:
+    state = None if mode is None else LoopState(mode, 50.0, 50.0, 41.0, OLD, False, 0.0, 100.0, 0.1, True, 42.5)
+    found = FalsePvJob("4f0c2a9be113", "A", "gw-2", AT, Reason.PV_FROZEN, None if state is None else state_json(state))
+    known = facts(false_pvs=(found,), tests=(job(JobState.FAILED, Reason.PV_FROZEN),))
+    ((alarm,), (later,)) = steps(known, 0.0, 1e6)
+    assert (alarm.level, alarm.kind, alarm.loops, alarm.host) == (1, AlarmKind.FALSE_PV, ["A"], "gw-2")
+    assert alarm.text == f"PV was found to be false in a test: {words}"
+    assert "No test begins until somebody signs this off" in alarm.advice and alarm.to_sign
+    assert later == alarm, "it is the only alarm of that test"
+    assert not conditions(replace(known, false_pvs=(), signed=frozenset({alarm.id}))), "nor is there one afterwards"
+
+
 def test_a_loop_that_was_not_confirmed_to_be_as_before_is_an_alarm_at_once_and_until_it_is_signed_off() -> None:
     known = facts(unconfirmed=(unconfirmed(),), tests=(job(JobState.FAILED, Reason.RESTORE_UNCONFIRMED),))
     ((alarm,), (later,)) = steps(known, 0.0, 1e6)
@@ -84,7 +105,7 @@ def test_a_loop_that_was_not_confirmed_to_be_as_before_is_an_alarm_at_once_and_u
     assert "Look at the controller now" in alarm.advice and "until somebody signs it off" in alarm.advice
     assert (alarm.since, alarm.host, alarm.job, alarm.to_sign) == (AT, "gw-2", "/jobs/4f0c2a9be113", True)
     assert later == alarm, "it is the only alarm of that test"
-    ids = {alarm_id(NOT_RESTORED, "4f0c2a9be113"), alarm_id("test_failed", "4f0c2a9be113")}
+    ids = {alarm_id(kind, "4f0c2a9be113") for kind in (NOT_RESTORED, FALSE_PV, "test_failed")}
     assert to_be_asked(facts(tests=known.tests)) == ids
     signed = facts(tests=known.tests, signed=frozenset({alarm.id}))
     assert not conditions(signed), "whoever has signed it off has seen how the test ended"

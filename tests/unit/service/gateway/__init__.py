@@ -92,6 +92,9 @@ class FileLoop:
         self._n += 1
         return Sample(0.1 * self._n, 50.0, 50.0, 40.0, int(Mode.AUTOMATIC))
 
+    def hold(self) -> None:
+        raise NotImplementedError("PV is true here")
+
     def restore(self, home: LoopState, session: int | None = None) -> Restored:
         while (self._folder / f"{self._tag}.held").exists():
             time.sleep(0.005)

@@ -12,7 +12,9 @@ from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
 from loopwright.plantsim.catalogue import LaterPath
+from loopwright.service.alarms.watch import AlarmWatch
 from loopwright.service.inputs.request import FastRetune
+from loopwright.service.listening.listening import Listening
 from loopwright.service.states.acceptance_watch import TroubleKind, WatchEnd
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store import audit, job_knowledge
@@ -253,6 +255,50 @@ def test_pv_that_was_never_inside_does_not_leave_its_limits(service: Service) ->
     here.accept()
     here.goes_on(3.0)
     assert here.watch.trouble is None and not here.watch.inside
+
+
+@pytest.mark.parametrize("shown", ["last", 50.2, 25.0, 0.0, 100.0])
+@pytest.mark.parametrize("roll_back", [True, False])
+def test_a_false_pv_is_an_alarm_and_nothing_is_written(service: Service, shown: float | str, roll_back: bool) -> None:
+    """Also one that is outside of the limits, where the old gains would come back."""
+    limits = service.loops[TAG].pv_limits.model_copy(update={"low": 40.0, "high": 60.0})
+    service.loops[TAG] = service.loops[TAG].model_copy(update={"pv_limits": limits})
+    here = WatchedLoop(service)
+    here.accept(roll_back)
+    here.goes_on(6.0)
+    before, last = service.controller.state, here.pv
+    here.shown = lambda pv: last if isinstance(shown, str) else shown
+    here.goes_on(6.0)
+    trouble = here.watch.trouble
+    assert trouble is not None and (trouble.kind, trouble.put_back) == (TroubleKind.FALSE_PV, False)
+    assert service.controller.state == before and service.controller.session == 0
+    assert service.store.get(here.job_id).state is JobState.ACCEPTED
+    assert "no reason to change gains" in here.watch.words
+    (alarm,) = AlarmWatch(service.jobs, Listening(service.jobs.directory.loops, service.store, on=False)).look()
+    assert (alarm.level, alarm.kind) == (1, "false_pv") and alarm.text.startswith("PV is false. PV ")
+    assert "it is in automatic on this PV unless you put it in manual" in alarm.advice
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_single_wrong_samples_are_no_false_pv(service: Service, count: int) -> None:
+    here = WatchedLoop(service)
+    here.accept()
+    here.goes_on(6.0)
+    wrong = iter([0.0] * count)
+    here.shown = lambda pv: next(wrong, pv)
+    here.goes_on(6.0)
+    assert here.watch.trouble is None
+
+
+@pytest.mark.parametrize("quantum", [0.03, 0.3, 1.0])
+def test_a_pv_that_is_rounded_or_that_a_load_moves_is_true(service: Service, quantum: float) -> None:
+    here = WatchedLoop(service)
+    here.shown = lambda pv: round(pv / quantum) * quantum
+    here.accept()
+    here.goes_on(8.0)
+    here.plant.disturbance = 3.0
+    here.goes_on(8.0, 1.0)
+    assert here.watch.trouble is None
 
 
 @pytest.mark.parametrize("mode", [Mode.AUTOMATIC, Mode.MANUAL])

@@ -80,6 +80,8 @@ class WatchedLoop:
         )
         self.channel.setpoint = 50.0
         self.pv = self.plant.pv
+        self.shown: Callable[[float], float] = lambda pv: pv
+        """What the sensor shows of PV."""
         self.gap = GAP_BEFORE
         self.heard_at_all = True
         self.frames_lost = False
@@ -139,7 +141,7 @@ class WatchedLoop:
                 self.gap = 0
             else:
                 self.gap = GAP_BEFORE
-            self.pv = self.plant.step(50.0 + self.factor(self.n) * (mv - 50.0))
+            self.pv = self.shown(self.plant.step(50.0 + self.factor(self.n) * (mv - 50.0)))
         if self.ears.gains_are_read:
             self.ears.read = controller.state.gains, self.passed_s
         sp = self.channel.setpoint

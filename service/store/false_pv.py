@@ -1,0 +1,44 @@
+"""The tests that have found PV to be false: no other begins on the loop until a person has acknowledged it, which is to
+sign off its alarm.
+
+A loop that was in automatic is in manual since, and nothing of ours takes it back. The column is `JobRow.false_pv`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy import Select, select
+from sqlalchemy.orm import Session
+
+from loopwright.service.errors import NotAcknowledged
+from loopwright.service.store.tables import AlarmSignOffRow, JobRow
+
+FALSE_PV = "false_pv"
+"""The kind of its alarm."""
+
+
+def check(session: Session, loop: str) -> None:
+    """Raises NotAcknowledged."""
+    job = session.scalars(_not_acknowledged().where(JobRow.loop == loop)).first()
+    if job is not None:
+        raise NotAcknowledged(words(job))
+
+
+def not_acknowledged(session: Session, loop: str | None = None) -> Sequence[JobRow]:
+    """Returns the tests of every host, or of one loop, that nobody has acknowledged, oldest first."""
+    wanted = _not_acknowledged()
+    return session.scalars(wanted if loop is None else wanted.where(JobRow.loop == loop)).all()
+
+
+def words(job: JobRow) -> str:
+    """Returns what was found, and how it is acknowledged."""
+    return (
+        f"job {job.id} found PV of loop {job.loop} to be false at {job.ended_at}, and nobody has acknowledged that: "
+        f"check the sensor and the loop's mode, then sign the alarm off, or: loopwright dismiss {job.loop}"
+    )
+
+
+def _not_acknowledged() -> Select[JobRow]:
+    signed = select(AlarmSignOffRow.job_id).where(AlarmSignOffRow.job_id == JobRow.id, AlarmSignOffRow.kind == FALSE_PV)
+    return select(JobRow).where(JobRow.false_pv.is_(True), ~signed.exists()).order_by(JobRow.number)

@@ -1,0 +1,355 @@
+"""A PV that is false within its limits, told sample by sample: it stands still, changes its noise, or jumps, as the plant
+cannot.
+
+What PV does at rest is learned first (`PvAtRest`): how long it stays exactly equal, how often it is renewed, its noise
+and its quantum. A test then hands over each sample (`PvWatch`), and hears at once where PV is
+
+- exactly equal for far longer than ever at rest, where its noise moves it;
+- still, with noise far below or far above its own;
+- elsewhere within one sample, by hundreds of noises and far more than it ever moved, without the way there that a lag
+  takes, and stays there for longer than a few wrong samples do.
+
+Of a PV without noise, or rounded so coarsely that noise does not move it, equal values say little: it is false where it
+does not answer a move of MV in a time that no dead time takes, or stops from one sample to the next in the middle of its
+way, with MV away from where PV was at rest. What is not told by that the test's own waits have to bound.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import fdtri
+
+from loopwright.tuning.reasons import FalsePv, Reason
+
+MIN_RENEWALS = 30
+"""Number of values, each renewed, that the rest must have for its noise to be known."""
+MIN_REVERSALS, MIN_LEVELS, MAX_RUN_PART = 8, 3, 0.25
+"""Noise moves PV at rest where it turns round at least so often, has so many values, and is never equal for longer than
+this part of the rest. Of two values alone nothing is known of the noise between them."""
+RUN_OF_REST, RUN_MORE = 2, 10
+"""PV is equal for too long after so many times the longest run at rest and so many samples more."""
+RARE = 1e-8
+"""Probability, by its noise alone, of what a true PV is taken for false for, in one look."""
+LONGEST_BY_CHANCE = 120
+"""Longest run, in renewals, that is waited for where rounding and noise permit it. Beyond that noise says nothing."""
+WINDOWS = (8, 10, 12, 14, 16, 18, 20, 23, 26, 30, 35, 40)
+"""Numbers of renewals over which the noise is looked at."""
+QUIETER_THAN_REST = 0.5
+"""Part of the smallest variance at rest over as many samples, below which that of a false PV is."""
+COARSE = 1.0
+"""Quantum in noises above which PV may be equal by chance for so long that its variance says nothing."""
+LOUD_WINDOW, LOUD_VALUES, LOUD = 15, 7, 2.3
+"""PV is too loud where so many of so many values are off their median by more than so many noises: a few wrong samples
+are not."""
+WHITE = 1.2
+"""Smallest ratio of von Neumann of noise around a PV that stands still (2 on average); it is far smaller where PV
+moves."""
+JUMP_NOISES, JUMP_MOVES = 100.0, 20.0
+"""A jump is at least so many noises, and so many times the largest move within a sample so far."""
+JUMP_STAYS, JUMP_BAND = 6, 0.25
+"""PV has to stay for so many samples within this part of the jump."""
+ANSWERED_NOISES = 10.0
+"""Distance from rest, in noises, from which PV has answered MV."""
+QUIET_MORE, LARGE_MOVE = 15, 0.3
+"""A PV that noise does not move has to answer a move of MV, of at least this part of MV's largest so far, within twice
+the rest's duration, which is no shorter than half of T95, and so many samples more."""
+STEADY_CHANGES, STEADY_SPEED, STOPPED_RUNS = 12, 0.4, 6
+"""It has stopped in the middle of its way where its last changes, so many, went one way, the last no slower than this
+part of the fastest, and it is then equal for so many times the longest of their runs and QUIET_MORE samples. At a
+turning point it is equal for at most 4.8 times its last run, with a dead band 5.9 times."""
+LONGEST_REST = 20_000
+"""Largest number of samples at rest that are looked at."""
+
+
+@dataclass(frozen=True, slots=True)
+class PvAtRest:
+    """What PV does at rest.
+
+    samples: their number.  value: the mean, PV units.
+    longest_run: the largest number of samples in a row that were exactly equal.
+    renewal: the number of samples from one new value to the next.
+    noise: the standard deviation of PV around a mean that stands still, PV units; the larger of that by differences and
+    that over LOUD_WINDOW values.  least_noise: the smaller of both.
+    quantum: the smallest distance of two values, PV units.
+    largest_move: the largest move from one sample to the next, PV units.
+    run_limit: the number of equal samples in a row from which PV is false; None where noise does not move PV.
+    least_variances: for each of WINDOWS, the variance below which PV is false; 0 where that is not known.
+    """
+
+    samples: int
+    value: float
+    longest_run: int
+    renewal: int
+    noise: float
+    least_noise: float
+    quantum: float
+    largest_move: float
+    run_limit: int | None
+    least_variances: tuple[float, ...]
+
+    @classmethod
+    def of(cls, pv: Sequence[float]) -> PvAtRest:
+        """pv: consecutive samples at rest, PV units; the last LONGEST_REST are looked at."""
+        x = np.asarray(pv[-LONGEST_REST:], dtype=float)
+        n = len(x)
+        if n < 2:
+            value = float(x[0]) if n else math.nan
+            return cls(n, value, n, 1, 0.0, 0.0, 0.0, 0.0, None, (0.0,) * len(WINDOWS))
+        edges = np.flatnonzero(np.diff(x)) + 1
+        runs = np.diff([0, *edges, n])
+        longest = int(runs.max())
+        renewal = int(np.quantile(runs[1:-1], 0.1, method="lower")) if len(runs) > 2 else 1
+        levels = np.unique(x)
+        quantum = float(np.diff(levels).min()) if len(levels) > 1 else 0.0
+        moves = np.diff(x[edges]) if len(edges) > 1 else np.zeros(0)
+        reversals = int(np.count_nonzero(moves[1:] * moves[:-1] < 0.0))
+        values = x[renewal - 1 :: renewal]
+        by_differences = 0.5 * float(np.mean(np.diff(values) ** 2)) if len(values) > 1 else 0.0
+        variances = {w: _variances(values, w) for w in (*WINDOWS, LOUD_WINDOW) if w <= len(values)}
+        over = float(np.mean(variances[LOUD_WINDOW])) if LOUD_WINDOW in variances else by_differences
+        largest = float(np.abs(np.diff(x)).max())
+        limit: int | None = None
+        least = [0.0] * len(WINDOWS)
+        moved = reversals >= MIN_REVERSALS and len(levels) >= MIN_LEVELS and longest <= MAX_RUN_PART * n
+        if moved and len(values) >= MIN_RENEWALS:
+            chance = _longest_by_chance(quantum, by_differences)
+            if chance <= LONGEST_BY_CHANCE:
+                limit = max(RUN_OF_REST * longest + RUN_MORE, math.ceil(chance * renewal))
+            small = min(by_differences, over)
+            if quantum <= COARSE * math.sqrt(small):
+                for at, w in enumerate(WINDOWS):
+                    if w in variances:
+                        by_noise = small * float(fdtri(w - 1, len(values) // 2, RARE))
+                        least[at] = min(by_noise, QUIETER_THAN_REST * float(variances[w].min()))
+        noise, least_noise = (math.sqrt(each(by_differences, over)) for each in (max, min))
+        return cls(n, float(np.mean(x)), longest, renewal, noise, least_noise, quantum, largest, limit, tuple(least))
+
+    @property
+    def lively(self) -> bool:
+        """Whether noise moves PV at rest, so that equal values tell."""
+        return self.run_limit is not None
+
+
+def check_end_of_rest(pv: Sequence[float]) -> None:
+    """Raises FalsePv, PV_FROZEN, where PV has come to stand still at the end of its rest. pv: the samples, PV units."""
+    run = next((n for n, value in enumerate(reversed(pv)) if value != pv[-1]), len(pv))
+    before = PvAtRest.of(pv[: len(pv) - run])
+    if before.run_limit is not None and run > before.run_limit:
+        text = f"where it never stood still for more than {before.longest_run}"
+        raise FalsePv(Reason.PV_FROZEN, f"PV is exactly {pv[-1]:.6g} for the last {run} samples at rest, {text}")
+
+
+def _variances(values: np.ndarray, window: int) -> np.ndarray:
+    return np.lib.stride_tricks.sliding_window_view(values, window).var(axis=1, ddof=1)
+
+
+def _longest_by_chance(quantum: float, variance: float) -> float:
+    """The run of equal values that noise of this variance (after rounding), rounded to this quantum, leaves by chance
+    with the probability RARE where the mean of PV stands in the middle of a quantum."""
+    if quantum <= 0.0:
+        return 0.0
+    noise = math.sqrt(max(variance - quantum**2 / 12.0, 0.0))
+    if noise == 0.0:
+        return math.inf
+    stays = math.erf(quantum / (2.0 * math.sqrt(2.0) * noise))
+    return math.log(RARE) / math.log(stays) if stays < 1.0 else math.inf
+
+
+class PvWatch:
+    """Looks at each sample from the first move of a test on.
+
+    rest: what PV did before.  mv: MV at rest, MV units.
+    direction: +1 where PV rises with MV, -1 where it falls.
+    mv_low, mv_high: MV's limits, MV units.
+    """
+
+    def __init__(self, rest: PvAtRest, mv: float, direction: float, mv_low: float, mv_high: float) -> None:
+        self._rest, self._mv_home, self._direction = rest, mv, direction
+        self._low, self._high = mv_low, mv_high
+        self._hair = 1e-3 * abs(mv_high - mv_low) if math.isfinite(mv_high - mv_low) else 0.0
+        self._n = 0
+        self._last = math.nan
+        self._run = 1
+        self._longest_run = 0
+        """The longest run since the first move of MV that PV has ended."""
+        self._answered = False
+        self._largest = rest.largest_move
+        self._jump: _Jump | None = None
+        self._farthest_mv = 0.0
+        self._moved_mv: tuple[float, int] = (mv, -1)
+        """The last move of MV that PV has to answer: MV after it, and its sample."""
+        self._answer_due: int | None = None
+        """The first such move since PV is equal."""
+        self._changes: deque[tuple[float, int]] = deque(maxlen=STEADY_CHANGES)
+        """The last moves of PV, and the number of samples for which it was equal before each."""
+        length = max(WINDOWS) + 1
+        self._values: deque[float] = deque(maxlen=LOUD_WINDOW)
+        self._sums: deque[float] = deque([0.0], maxlen=length)
+        self._squares: deque[float] = deque([0.0], maxlen=length)
+
+    def check(self, pv: float, mv: float) -> None:
+        """Takes the next sample. Raises FalsePv: PV_FROZEN, BAD_SAMPLE."""
+        self._n += 1
+        self._watch_mv(mv)
+        equal = pv == self._last
+        if equal:
+            self._run += 1
+            self._check_run(pv, mv)
+        else:
+            self._ends_run(pv)
+        if self._rest.lively and (self._n - 1) % self._rest.renewal == 0:
+            self._check_noise(pv)
+        self._check_jump(pv, mv)
+        self._last = pv
+
+    # equal values
+
+    def _watch_mv(self, mv: float) -> None:
+        """Notes moves of MV that are large beside those of the test."""
+        self._farthest_mv = max(self._farthest_mv, abs(mv - self._mv_home))
+        if abs(mv - self._moved_mv[0]) > max(LARGE_MOVE * self._farthest_mv, self._hair):
+            self._moved_mv = (mv, self._n)
+            if self._answer_due is None:
+                self._answer_due = self._n
+
+    def _ends_run(self, pv: float) -> None:
+        if self._n > 1:
+            self._longest_run = max(self._longest_run, self._run)
+            self._changes.append((pv - self._last, self._run))
+        self._run, self._answer_due = 1, None
+
+    def _check_run(self, pv: float, mv: float) -> None:
+        rest, run = self._rest, self._run
+        if rest.run_limit is not None:
+            if run > rest.run_limit:
+                text = f"where it never stood still for more than {rest.longest_run} at rest"
+                raise FalsePv(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {run} samples, {text}")
+            return
+        if not self._changes:
+            return  # it has not moved since the test began: no sensor that ends, for all that is known
+        longest = max(RUN_OF_REST * rest.samples, RUN_OF_REST * self._longest_run) + QUIET_MORE
+        if self._answer_due is not None and self._n - self._answer_due > longest:
+            text = f"though MV moved to {self._moved_mv[0]:.4g} meanwhile; before, it answered"
+            raise FalsePv(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {run} samples, {text}")
+        if abs(mv - self._mv_home) > self._hair and self._low + self._hair < mv < self._high - self._hair:
+            self._check_stop(pv, mv)
+
+    def _check_stop(self, pv: float, mv: float) -> None:
+        """A PV that noise does not move, and that stops from one sample to the next."""
+        changes = self._changes
+        if len(changes) < STEADY_CHANGES or self._run <= QUIET_MORE:
+            return
+        longest = max(run for _, run in changes)
+        if self._run <= STOPPED_RUNS * longest + QUIET_MORE:
+            return
+        sign = math.copysign(1.0, changes[-1][0])
+        speeds = [sign * move / run for move, run in changes]
+        if min(speeds) > 0.0 and speeds[-1] >= STEADY_SPEED * max(speeds):
+            way = sum(move for move, _ in changes)
+            text = f"after it had moved by {way:+.4g} in {sum(run for _, run in changes)}, with MV still at {mv:.4g}"
+            raise FalsePv(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {self._run} samples, {text}")
+
+    # noise
+
+    def _check_noise(self, pv: float) -> None:
+        rest = self._rest
+        x = pv - rest.value
+        self._values.append(x)
+        sums, squares = self._sums, self._squares
+        sums.append(sums[-1] + x)
+        squares.append(squares[-1] + x * x)
+        count = len(sums) - 1
+        for window, least in zip(WINDOWS, rest.least_variances, strict=True):
+            if window > count:
+                break
+            total = sums[-1] - sums[-1 - window]
+            variance = (squares[-1] - squares[-1 - window] - total * total / window) / (window - 1)
+            if variance < least:
+                self._false_noise(pv, window, math.sqrt(max(variance, 0.0)))
+        if len(self._values) == LOUD_WINDOW and self._jump is None:
+            self._check_loud(pv)
+
+    def _check_loud(self, pv: float) -> None:
+        rest, values = self._rest, self._values
+        far = LOUD * rest.noise + (rest.quantum if rest.quantum > 0.5 * rest.noise else 0.0)
+        ordered = sorted(values)
+        if ordered[-1] - ordered[0] < far:
+            return
+        median = ordered[LOUD_WINDOW // 2]
+        if sum(abs(value - median) > far for value in values) < LOUD_VALUES:
+            return
+        x = np.asarray(values)
+        squares = float(np.sum((x - x.mean()) ** 2))
+        if float(np.sum(np.diff(x) ** 2)) > WHITE * squares:
+            self._false_noise(pv, LOUD_WINDOW, math.sqrt(squares / (LOUD_WINDOW - 1)))
+
+    def _false_noise(self, pv: float, values: int, noise: float) -> None:
+        rest = self._rest
+        samples = values * rest.renewal
+        text = f"PV stands at {rest.value + sum(self._values) / len(self._values):.6g} for {samples} samples"
+        shown = f"with noise of {noise:.3g}, {noise / rest.noise:.2g} times that at rest ({rest.noise:.3g})"
+        raise FalsePv(Reason.PV_FROZEN, f"{text}, {shown}")
+
+    # jumps
+
+    def _check_jump(self, pv: float, mv: float) -> None:
+        rest = self._rest
+        if self._jump is not None:
+            self._go_on_with_jump(self._jump, pv)
+            return
+        if self._n < 2:
+            return
+        move = pv - self._last
+        known = rest.lively or len(self._changes) == STEADY_CHANGES
+        if known and abs(move) > max(JUMP_NOISES * rest.noise, JUMP_MOVES * self._largest) > 0.0:
+            first = not self._answered and move * self._direction * (mv - self._mv_home) > 0.0
+            seldom = not self._answered and rest.renewal > 1
+            if not first and not seldom:
+                self._jump = _Jump(self._last, pv, self._largest)
+                return
+        if abs(pv - rest.value) > ANSWERED_NOISES * rest.noise:
+            self._answered = True
+        self._largest = max(self._largest, abs(move))
+
+    def _go_on_with_jump(self, jump: _Jump, pv: float) -> None:
+        rest = self._rest
+        jump.since += 1
+        size = jump.to - jump.before
+        if abs(pv - jump.to) > JUMP_BAND * abs(size):
+            if abs(pv - jump.before) > JUMP_BAND * abs(size):
+                self._largest = max(self._largest, abs(size))  # it goes on: a fast plant
+            self._jump = None
+            return
+        ways = 2 * rest.renewal
+        if jump.since == ways:
+            further = math.copysign(1.0, size) * (pv - jump.to)
+            if further > ways * jump.largest_move + 5.0 * rest.noise:
+                self._largest = max(self._largest, abs(size))
+                self._jump = None
+                return
+        if jump.since >= max(JUMP_STAYS, ways + 1) - 1:
+            noises = f"{abs(size) / rest.noise:.0f} noises" if rest.noise else "it has no noise"
+            text = f"PV went from {jump.before:.6g} to {jump.to:.6g} within one sample ({noises})"
+            moved = (
+                f"and has stayed there for {jump.since + 1}; it had never moved by more than {jump.largest_move:.3g}"
+            )
+            raise FalsePv(Reason.BAD_SAMPLE, f"{text}, {moved} in a sample")
+
+
+@dataclass(slots=True)
+class _Jump:
+    """A jump that is looked at.
+
+    before, to: PV before and after it, PV units.  largest_move: the largest move within a sample before, PV units.
+    since: the number of samples since.
+    """
+
+    before: float
+    to: float
+    largest_move: float
+    since: int = 0
