@@ -32,6 +32,7 @@ from loopwright.tuning.plan import (
 from loopwright.tuning.reasons import Aborted, Ended, Failed, Reason
 
 T = TypeVar("T")
+_UNREACHED = (Reason.NODE_LOST, Reason.NODE_NOT_ANSWERING, Reason.BUS_LOST)
 CHUNK = 200
 CHUNK_S = 1.0
 """Plant time after which samples are passed on, s, if there are fewer than CHUNK: a service that dies loses no more."""
@@ -198,7 +199,7 @@ class _Run(Generic[T]):
             restored = self._loop.restore(home)
         except Ended as ended:
             self._on_event(Note(f"restore: {ended}"))
-            if result.ended is None or result.ended.reason not in (Reason.NODE_LOST, Reason.BUS_LOST):
+            if result.ended is None or result.ended.reason not in _UNREACHED:
                 result.value, result.ended = None, ended
         else:
             result.restored = restored.state
