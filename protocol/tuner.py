@@ -6,6 +6,7 @@ silent. Frames that arrive during an SDO are taken in order and returned later.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ from enum import StrEnum
 
 from loopwright.protocol.bus import Bus, Frame
 from loopwright.protocol.objects import Device, Object, Shape, Type, Value, lookup
-from loopwright.protocol.patience import Patience
+from loopwright.protocol.patience import WAIT_S, Patience
 from loopwright.protocol.process_data import BusSample, ProcessData
 from loopwright.protocol.profile import (
     HEARTBEAT_FRAME,
@@ -43,6 +44,8 @@ _ABORT = 0x80
 _URGENT = ("controller_session_renewal", "controller_order_close", "controller_order_hold")
 RENEWAL_S = 0.5
 """Wall time between two renewals of a session's lease, s. They are not answered, and some may be lost."""
+BEAT_S = 0.6
+"""Time within which a node of the profile sends its next heartbeat, s."""
 TURN_S = 10.0
 """Longest wait for a node's lock, s. After it the loop renews no lease any more, because the lock's holder hangs."""
 
@@ -78,12 +81,14 @@ class FailureKind(StrEnum):
 
 
 class TunerError(Exception):
-    """Raised for an SDO that failed: without an answer (TIMEOUT), or refused by the device with `code` (ABORT)."""
+    """Raised for an SDO that failed: without an answer (TIMEOUT) of `node`, or refused by the device with `code`
+    (ABORT)."""
 
-    def __init__(self, kind: FailureKind, text: str, code: int = 0) -> None:
+    def __init__(self, kind: FailureKind, text: str, code: int = 0, node: int = 0) -> None:
         super().__init__(text)
         self.kind = kind
         self.code = code
+        self.node = node
 
 
 class Tuner(ProcessData):
@@ -134,6 +139,8 @@ class Tuner(ProcessData):
         self._check_stop_request: Callable[[], None] = lambda: None
         self.node_states: dict[int, int] = {}
         """NMT states of controller and plant from their latest heartbeats, by node-ID."""
+        self._beaten_at: dict[int, float] = {}
+        """Times on the clock at which a heartbeat of controller and plant was received last, by node-ID, s."""
         self.restarted = False
         """Whether the controller has sent a boot-up frame."""
 
@@ -168,6 +175,17 @@ class Tuner(ProcessData):
             self._renewed_at = now
             self._bus.send(renewal_id(self._controller), RENEWAL_FRAME.pack(self.session, self._channel))
         return now
+
+    def beats(self, node: int) -> bool:
+        """Whether a node that has just left a request unanswered still sends heartbeats. One that was never heard is
+        given the time of a heartbeat."""
+        give_up = self.station.monotonic() + BEAT_S
+        while node in self._alive.values() and node not in self._beaten_at:
+            left = give_up - self.heartbeat()
+            if left <= 0.0:
+                return False
+            self._receive(min(left, WAIT_S))
+        return self.station.monotonic() - self._beaten_at.get(node, -math.inf) < BEAT_S
 
     def sample(self, timeout_s: float) -> BusSample | None:
         """Returns the next sample in order, or None when none came within `timeout_s` of wall time."""
@@ -211,6 +229,7 @@ class Tuner(ProcessData):
             elif can_id in self._alive:
                 (state,) = HEARTBEAT_FRAME.unpack(data)
                 self.node_states[self._alive[can_id]] = state
+                self._beaten_at[self._alive[can_id]] = self.station.monotonic()
                 self.restarted |= state == NmtState.BOOT_UP and self._alive[can_id] == self._controller
             else:
                 self._answers.append(frame)
@@ -313,7 +332,7 @@ class Tuner(ProcessData):
                     raise _aborted(entry, answer)
                 if answer[0] & 0xE0 == expected:
                     return answer
-        raise TunerError(FailureKind.TIMEOUT, f"node {node_name(node)} does not answer ({entry.name})")
+        raise TunerError(FailureKind.TIMEOUT, f"node {node_name(node)} does not answer ({entry.name})", node=node)
 
     def _segments(self, entry: Object, node: int, begun: bytes) -> bytes:
         """Returns a value that is longer than one frame, such as a string.
@@ -340,7 +359,8 @@ class Tuner(ProcessData):
         while not taken:
             answer = self._answer(node, patience) if self.station.monotonic() < give_up else None
             if answer is None:
-                raise TunerError(FailureKind.TIMEOUT, f"node {node_name(node)} stopped in the middle of {entry.name}")
+                text = f"node {node_name(node)} stopped in the middle of {entry.name}"
+                raise TunerError(FailureKind.TIMEOUT, text, node=node)
             if answer[0] == _ABORT:
                 raise _aborted(entry, answer)
             taken = upload.take(answer)

@@ -57,6 +57,7 @@ class Reason(StrEnum):
     SAMPLES_LOST = "samples_lost"
     PV_FROZEN = "pv_frozen"
     NODE_LOST = "node_lost"
+    NODE_NOT_ANSWERING = "node_not_answering"
     BUS_LOST = "bus_lost"
     GATEWAY_LOST = "gateway_lost"
     NODE_NOT_OPERATIONAL = "node_not_operational"
@@ -138,6 +139,9 @@ ADVICE: dict[Reason, str] = {
     Reason.MODE_CHANGED: "Somebody else changed the mode during the test; agree on the time and repeat.",
     Reason.GAINS_CHANGED: "Somebody else tried other gains during the test; agree on the time and repeat.",
     Reason.NODE_LOST: "The device fell silent: check power and cable; it goes home by itself.",
+    Reason.NODE_NOT_ANSWERING: "The device sends heartbeats and answers no request, so it has power and a cable: see "
+    "whether its SDO server hangs or is kept busy by another master, or the bus loses frames; start its program anew "
+    "when the loop permits. It goes home by itself.",
     Reason.BUS_LOST: "Check the CAN interface, its name and whether it is up; the device goes home by itself.",
     Reason.GATEWAY_LOST: "The gateway of the loop alone reaches it: see that its service runs and reaches the "
     "database. What is under test there goes on, or ends safely by itself.",

@@ -33,6 +33,7 @@ from loopwright.tuning.plan import (
 from loopwright.tuning.reasons import Aborted, Ended, Failed, FalsePv, Reason
 
 T = TypeVar("T")
+_UNREACHED = (Reason.NODE_LOST, Reason.NODE_NOT_ANSWERING, Reason.BUS_LOST)
 CHUNK = 200
 CHUNK_S = 1.0
 """Plant time after which samples are passed on, s, if there are fewer than CHUNK: a service that dies loses no more."""
@@ -209,7 +210,7 @@ class _Run(Generic[T]):
             restored = self._loop.restore(home)
         except Ended as ended:
             self._on_event(Note(f"restore: {ended}"))
-            lost = result.ended is not None and result.ended.reason in (Reason.NODE_LOST, Reason.BUS_LOST)
+            lost = result.ended is not None and result.ended.reason in _UNREACHED
             if not lost and not isinstance(result.ended, FalsePv):
                 result.value, result.ended = None, ended
         else:

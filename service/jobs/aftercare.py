@@ -29,7 +29,7 @@ LONGEST_S = 30.0
 """Longest wall time between two readings of a loop that stays unreachable, s; the time doubles up to this."""
 _AT_ONCE = 8
 _STOP_S = 10.0
-_UNREACHED = (Reason.NODE_LOST, Reason.BUS_LOST, Reason.NODE_NOT_OPERATIONAL)
+_UNREACHED = (Reason.NODE_LOST, Reason.NODE_NOT_ANSWERING, Reason.BUS_LOST, Reason.NODE_NOT_OPERATIONAL)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from loopwright.protocol.bus import BusError
 from loopwright.protocol.profile import Abort, NmtState, node_name
 from loopwright.protocol.station import NodeTaken, Station
 from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
-from loopwright.service.loops.bus_reading import BusReading, not_operational
+from loopwright.service.loops.bus_reading import BusReading, not_operational, state_name
 from loopwright.tuning.reasons import Failed, Reason, Refused
 
 AGAIN_S = 0.05
@@ -94,10 +94,13 @@ class BusConnection:
         return Refused(Reason.DEVICE_MISMATCH, str(error))
 
     def _no_answer(self, error: TunerError) -> Failed:
-        """Distinguishes a node in the state stopped, which sends heartbeats and answers no SDO, from one that is
-        gone."""
+        """Distinguishes a node that sends heartbeats and answers no SDO, in the state stopped or another, from one that
+        is gone."""
         states = self._tuner.node_states if self._tuner is not None else {}
         for node in (self.controller, self.plant):
             if node is not None and states.get(node) == NmtState.STOPPED:
                 return not_operational(node, NmtState.STOPPED)
+        if self._tuner is not None and self._tuner.beats(error.node):
+            text = f"{error}, and beats: its heartbeat is heard ({state_name(states.get(error.node, NmtState.OPERATIONAL))})"
+            return Failed(Reason.NODE_NOT_ANSWERING, text)
         return Failed(Reason.NODE_LOST, str(error))

@@ -13,7 +13,7 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Failed, Reason, Refused
 
-SILENT = "silent"
+SILENT, NOT_ANSWERING = "silent", "beating, and answers no request"
 _WHEN_SILENT: dict[int, str] = {
     OnMissingAnswer.HOLD_OUTPUT: "holds MV where it is",
     OnMissingAnswer.STOP_RUN: "stops its run, and MV stays",
@@ -142,7 +142,7 @@ class BusReading:
     def controls(self, state: LoopState) -> bool:
         """Returns whether the loop is controlled. A plant that is away does not prevent it; one that answers must be
         operational."""
-        return state.node_state in (OPERATIONAL, self._plant_is(SILENT))
+        return state.node_state in (OPERATIONAL, self._plant_is(SILENT), self._plant_is(NOT_ANSWERING))
 
     def _gains(self, which: str) -> Gains:
         return Gains(*(self.tuner.number(f"controller_{which}_{name}") for name in GAINS))
@@ -163,7 +163,7 @@ class BusReading:
                 words += f" of {self.tuner.number('plant_safe_output', self.channel):.6g} %"
             return state, words
         except TunerError:
-            return SILENT, ""
+            return NOT_ANSWERING if self.tuner.beats(self.plant) else SILENT, ""
 
 
 def order_unknown(node: int, order: Order) -> Refused:

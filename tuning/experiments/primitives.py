@@ -10,6 +10,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.tuning.experiments.what_moved import WhatMoved, what_moved
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, SetMode, SetOutput, SetSetpoint
 from loopwright.tuning.reasons import Reason, Refused
@@ -200,11 +201,12 @@ def settle(
     return (yield from until(done, stay_s / 8, max_s, commands))
 
 
-def to_rest(facts: Facts, point: OperatingPoint, band: float) -> Plan[None]:
+def to_rest(facts: Facts, point: OperatingPoint, band: float, tested: Trace | None = None) -> Plan[None]:
     """Brings the loop back to rest in manual at the output of the operating point, with the set-point put back.
 
     The plan waits at most 2 T95 for PV to be within the band (PV units) of the operating point.
-    Raises Refused: NOT_SELF_REGULATING or NOT_AT_REST if PV is then still far away.
+    tested: the record of the test before, if it tells whether PV answers MV.
+    Raises Refused: NOT_SELF_REGULATING or NOT_AT_REST if PV is then still far away, or as `held`.
     """
     home = (SetMode(Mode.MANUAL), SetOutput(point.mv), SetSetpoint(point.sp))  # manual first: entering it is bumpless
     trace, rested = yield from settle(point.pv, band, facts.T95_s / 5, 2 * facts.T95_s, point.noise, home)
@@ -215,23 +217,47 @@ def to_rest(facts: Facts, point: OperatingPoint, band: float) -> Plan[None]:
             stayed = f"held in manual at MV {point.mv:.4g}, PV stayed {away:+.4g} off {point.pv:.4g}"
             if away * moved > 0.5 * moved * moved > 0.5 * (0.2 * facts.sp_deviation) ** 2:
                 text = f"{stayed}, where the test had left it ({moved:+.4g}): it integrates, or the load has moved"
-                raise Refused(Reason.NOT_SELF_REGULATING, text)
+                if tested is None:
+                    raise Refused(Reason.NOT_SELF_REGULATING, text)
+                tested.extend(trace)
+                raise held(facts, point, tested, text, Reason.NOT_SELF_REGULATING)
             raise Refused(Reason.NOT_AT_REST, f"{stayed}: the load has moved")
 
 
+def what_moved_pv(facts: Facts, point: OperatingPoint, trace: Trace) -> WhatMoved:
+    """What has moved PV in the whole of a record. trace: from the first move of the test on."""
+    t, mv, pv = (np.asarray(each) for each in (trace.t, trace.mv, trace.pv))
+    return what_moved(t, mv - point.mv, pv - point.pv, facts.T95_s, point.noise)
+
+
+def held(facts: Facts, point: OperatingPoint, trace: Trace, text: str, otherwise: Reason) -> Refused:
+    """The refusal of a test that does not go on, for a procedure to raise, by the whole of its record and not by its
+    last moments: NO_RESPONSE, WRONG_SIGN, STALLED by a load disturbance, DISTURBED by a drift, or another reason.
+
+    trace: from the first move of the test on. text: what has not come to pass.
+    otherwise: the reason where PV has answered MV, and nothing else has moved it.
+    """
+    found = what_moved_pv(facts, point, trace)
+    reason = otherwise
+    if found.load:
+        reason = Reason.STALLED
+    elif not found.answered:
+        reason = Reason.NO_RESPONSE
+    elif found.drift:
+        reason = Reason.DISTURBED
+    elif (found.gain > 0.0) != facts.reverse:
+        reason, text = Reason.WRONG_SIGN, f"PV went the wrong way: {text}"
+    return Refused(reason, f"{text}; {found.in_words}")
+
+
 def no_oscillation(facts: Facts, point: OperatingPoint, trace: Trace, switches: int) -> Refused:
-    """The refusal of a relay test without a steady oscillation, for a procedure to raise: NO_RESPONSE, WRONG_SIGN or
-    CANNOT_OSCILLATE.
+    """The refusal of a relay test without a steady oscillation, for a procedure to raise, see `held`; CANNOT_OSCILLATE
+    where nothing but MV has moved PV.
 
     trace: the samples since the start of the relay.
     switches: the number of cycles of the relay.
     """
-    moved = float(np.mean(trace.pv[trace.tail(facts.T95_s / 5)])) - point.pv
-    expected = 1.0 if facts.reverse else -1.0
+    away = float(np.mean(trace.pv[trace.tail(facts.T95_s / 5)])) - point.pv
     cycles = f"{switches} cycle{'' if switches == 1 else 's'}"
-    after = f"{trace.t[-1] - trace.t[0]:.3g} s of relay (+-{point.room:.3g}, {cycles}) PV is {moved:+.3g} away"
-    if abs(moved) < max(5 * point.noise, 1e-3 * facts.sp_deviation):
-        return Refused(Reason.NO_RESPONSE, "after " + after)
-    if switches == 0 and moved * expected < 0:
-        return Refused(Reason.WRONG_SIGN, f"PV went the wrong way: after {after}")
-    return Refused(Reason.CANNOT_OSCILLATE, "no steady oscillation: after " + after)
+    after = f"after {trace.t[-1] - trace.t[0]:.3g} s of relay (+-{point.room:.3g}, {cycles}) PV is {away:+.3g} away"
+    return held(facts, point, trace, f"no steady oscillation: {after}", Reason.CANNOT_OSCILLATE)

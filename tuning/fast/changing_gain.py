@@ -52,8 +52,12 @@ def find_changing_gain(fit: Fit[ExperimentRecord], best: Fitted) -> ChangingGain
     """
     if not best.hypothesis.load_disturbances or len(fit.record.pieces) > 1:
         return None
-    found = [each for alternative in CHANGING_WITH_MV if (each := _fitted(fit, best, alternative)) is not None]
-    return max(found, key=lambda each: each.bic_gain, default=None)
+    return max(fit_changing_gains(fit, best), key=lambda each: each.bic_gain, default=None)
+
+
+def fit_changing_gains(fit: Fit[ExperimentRecord], best: Fitted) -> list[ChangingGain]:
+    """The gains that change with MV, fitted to a record of one piece without load disturbances."""
+    return [each for alternative in CHANGING_WITH_MV if (each := _fitted(fit, best, alternative)) is not None]
 
 
 def _fitted(fit: Fit[ExperimentRecord], best: Fitted, alternative: GainAlternative) -> ChangingGain | None:

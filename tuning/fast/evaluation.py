@@ -11,6 +11,7 @@ from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.requirements import keeping, possible_instead
 from loopwright.tuning.fast.score_tests import ScoreTests
 from loopwright.tuning.fast.structure_choice import RIVAL_BIC, StructureChoice, choose_structure
+from loopwright.tuning.fast.two_lags import find_two_lags
 from loopwright.tuning.fast.uncertainty import difference_of_rivals, durbin_watson_ratio, peak, uncertainty_of_Ms
 from loopwright.tuning.fast.valve_faults import find_valve_fault
 from loopwright.tuning.gains import Gains
@@ -43,6 +44,9 @@ one."""
 MAX_GAIN_CHANGE = 1.5
 """Largest accepted ratio of new to tested Kp or Ti where a load disturbance seems to have come with the tested
 gains."""
+
+LIKE_TWO_LAGS = (Reason.UNEXPLAINED, Reason.DISTURBED, Reason.AMBIGUOUS, Reason.MODEL_MISMATCH)
+"""Reasons that a linear model of a plant that rises and falls with different lags leads to."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,9 +115,12 @@ def evaluate(
         best = design.best() if kept is None else kept  # the record is judged in any case
     except Refused:
         if unexplained is None:
+            if (lags := find_two_lags(fit, found)) is not None:
+                raise Refused(Reason.UNEXPLAINED, lags.what) from None
             raise
         if earlier is None:
-            raise Refused(*unexplained) from None
+            lags = find_two_lags(fit, found)
+            raise Refused(*(unexplained if lags is None else (Reason.UNEXPLAINED, lags.what))) from None
         kept = best = earlier.best
     spread = uncertainty_of_Ms(fit, found, best.gains, design.w, spec.N, delay)
     rivals = difference_of_rivals(fit, found, chosen.rivals, best.gains, design.w, delay)
@@ -146,6 +153,9 @@ def evaluate(
     if reason is None and _stand_for_a_curve(record, found):
         what = "two load disturbances within one test explain the record"
         reason, detail = Reason.DISTURBED, f"{what}; a plant that is not linear would look the same"
+    if reason in LIKE_TWO_LAGS and not (test_follows and unexplained is None):
+        lags = find_two_lags(fit, found)
+        reason, detail = (reason, detail) if lags is None else (Reason.UNEXPLAINED, lags.what)
     if reason is None and kept is None:
         reason, detail = Reason.NOT_POSSIBLE, possible_instead(design)
     return Evaluation(

@@ -84,6 +84,11 @@ class Experiment:
         mv, pv = np.asarray(self.trace.mv), np.asarray(self.trace.pv)
         return mv - float(np.mean(mv[rest])), pv - float(np.mean(pv[rest]))
 
+    def _tested(self) -> Trace:
+        """The record since its rest."""
+        trace, at = self.trace, self.listened
+        return Trace(trace.t[at:], trace.sp[at:], trace.pv[at:], trace.mv[at:])
+
     def _control(self) -> ControlRecord:
         """What the record so far shows of the controller.
 

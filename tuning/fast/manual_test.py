@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
+from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, held
 from loopwright.tuning.fast.experiment import Experiment
 from loopwright.tuning.fast.manual_sizes import ManualRecord, first_pulse, largest_pulse, next_pulse, pv_bounds
 from loopwright.tuning.fast.proposal import PulseFigures
@@ -88,7 +88,7 @@ class ManualTest(Experiment):
     def first(self) -> Plan[None]:
         """Makes the first pulse, and waits until PV has come back by half by itself.
 
-        Raises Refused: NO_RESPONSE, NOT_SELF_REGULATING.
+        Raises Refused: NO_RESPONSE, and as `_until_back`.
         """
         for raised in range(MAX_RAISES + 1):
             self._begun, self._farthest = len(self.trace), 0.0
@@ -201,8 +201,9 @@ class ManualTest(Experiment):
         return u[self.listened :], y[self.listened :]
 
     def _until_back(self, width: int) -> Plan[None]:
-        """Waits until PV has come back by half from its farthest point of this pulse. Raises Refused,
-        NOT_SELF_REGULATING: it does not, so it would stay away, or run away, at the manual output found."""
+        """Waits until PV has come back by half from its farthest point of this pulse. Raises Refused
+        where it does not, see `held`; otherwise NOT_SELF_REGULATING: it would stay away, or run away, at the manual
+        output found."""
         facts = self.facts
         longest = max(self._samples(BACK_T95 * facts.T95_s), BACK_PULSES * width)
         back = len(self.trace)
@@ -215,12 +216,11 @@ class ManualTest(Experiment):
                     text = "PV has not come back, but a load disturbance explains that"
                     return (yield from self.report(Note(text)))
                 passed = (len(self.trace) - back) * facts.sample_time_s
-                raise Refused(
-                    Reason.NOT_SELF_REGULATING,
+                text = (
                     f"{passed:.3g} s after a pulse of {self.size:.4g} of MV, PV is {self._moved():+.4g} away, of "
-                    f"{farthest:.4g} at most: it does not come back by itself within {BACK_T95:g} T95, which a load "
-                    "disturbance does not explain either",
+                    f"{farthest:.4g} at most: it does not come back by itself within {BACK_T95:g} T95"
                 )
+                raise held(facts, self.point, self._tested(), text, Reason.NOT_SELF_REGULATING)
             yield from self.sample()
 
     def _turn(self, output: float) -> Plan[None]:

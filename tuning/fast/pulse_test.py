@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from loopwright.tuning.experiments.primitives import Directions, Facts, OperatingPoint, Trace
+from loopwright.tuning.experiments.primitives import Directions, Facts, OperatingPoint, Trace, held
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
 from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS, Experiment
 from loopwright.tuning.fast.forecast import Past
@@ -112,7 +112,7 @@ class PulseTest(Experiment):
         """Goes on until PV has followed the last move of the set-point far enough to turn.
 
         max_T95: the longest time for that, in T95.
-        Raises Refused, NO_RESPONSE or STALLED: PV does not follow.
+        Raises Refused where PV does not follow, see `held`; otherwise STALLED.
         """
         Ts = self.facts.sample_time_s
         while not self._followed():
@@ -274,7 +274,7 @@ class PulseTest(Experiment):
         self._watch_limits(sample)
 
     def _watch_limits(self, sample: Sample) -> None:
-        """Raises Refused, MV_LIMIT: MV stands at a limit, where PV is left to itself."""
+        """Raises Refused where MV stands at a limit, and PV is left to itself: MV_LIMIT, or as `held`."""
         facts = self.facts
         hair = HAIR * (facts.mv_high - facts.mv_low)
         at_limit = bool(self.turns) and not facts.mv_low + hair < sample.mv < facts.mv_high - hair
@@ -284,12 +284,13 @@ class PulseTest(Experiment):
         else:
             maximum = max(MAX_AT_LIMIT_T95 * facts.T95_s / facts.sample_time_s, MAX_AT_LIMIT_PART * self.elapsed)
         if self._at_limit > maximum:
-            raise Refused(
-                Reason.MV_LIMIT,
+            text = (
                 f"MV has stood at its limit of {sample.mv:.4g} for {self._at_limit * facts.sample_time_s:.3g} s, PV is "
                 f"{sample.pv - self.point.pv:+.3g} away for a set-point {sample.sp - self.point.sp:+.3g} away: a load "
-                "disturbance, or a fault of the plant, asks for more MV than is permitted",
+                "disturbance, or a fault of the plant, asks for more MV than is permitted"
             )
+            found = held(facts, self.point, self._tested(), text, Reason.MV_LIMIT)
+            raise Refused(Reason.MV_LIMIT, found.detail) if found.reason is Reason.STALLED else found
 
     def _fitting(self, gains: Gains) -> float:
         """The step of the set-point whose kick under these gains leaves room for MV, PV units."""
@@ -318,9 +319,7 @@ class PulseTest(Experiment):
     def _not_followed(self, passed: float) -> Refused:
         moved = float(np.mean(self.trace.pv[-SAMPLES_AVERAGED:])) - self.point.pv
         text = f"{passed:.3g} s after the set-point moved by {self.size:.3g} PV is {moved:+.3g} away"
-        if abs(moved) < MIN_FOLLOWED_NOISES * self.noise:
-            return Refused(Reason.NO_RESPONSE, text)
-        return Refused(Reason.STALLED, text)
+        return held(self.facts, self.point, self._tested(), text, Reason.STALLED)
 
 
 def pulse_size(sp_deviation: float, room: float, gains: Gains, one_sided: bool = False) -> float:

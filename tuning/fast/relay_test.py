@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, no_oscillation
+from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, held, no_oscillation
 from loopwright.tuning.fast.experiment import VERIFICATION_PERIODS, Experiment
 from loopwright.tuning.fast.proposal import RelayFigures
 from loopwright.tuning.fast.record import MIN_SWITCHES, ExperimentRecord, oscillation_period, period
@@ -105,7 +105,7 @@ class RelayTest(Experiment):
     def relay(self, switches: int) -> Plan[bool]:
         """Runs the relay until it has switched this number of times; False if the time is over before that.
 
-        Raises Refused: NO_RESPONSE, WRONG_SIGN, CANNOT_OSCILLATE up to the second switch, STALLED before the fourth.
+        Raises Refused, see `held`: otherwise CANNOT_OSCILLATE up to the second switch, STALLED before the fourth.
         """
         if not self.excited:
             self._begun = len(self.trace)
@@ -248,8 +248,8 @@ class RelayTest(Experiment):
 
     def _stalled(self) -> Refused:
         passed = (len(self.trace) - self._begun) * self.facts.sample_time_s
-        return Refused(
-            Reason.STALLED,
+        text = (
             f"the relay of {self.amplitude:.4g} switched {len(self.switches)} times in {passed:.4g} s, "
-            f"{MIN_SWITCHES} are needed; PV is {self.trace.pv[-1] - self.point.pv:+.4g} away",
+            f"{MIN_SWITCHES} are needed; PV is {self.trace.pv[-1] - self.point.pv:+.4g} away"
         )
+        return held(self.facts, self.point, self._since(), text, Reason.STALLED)

@@ -19,7 +19,7 @@ from typing import Literal, TypeVar
 from loopwright.tuning.analysis.comparison import Comparison, Predicted
 from loopwright.tuning.analysis.margins import Ultimate
 from loopwright.tuning.experiments.preflight import preflight
-from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, to_rest
+from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, held, to_rest
 from loopwright.tuning.experiments.step_limits import not_kept
 from loopwright.tuning.experiments.step_test import StepResult, allowed_step, step_test
 from loopwright.tuning.experiments.verification import verification
@@ -233,10 +233,11 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
     yield (StageDone("preflight", point),)
 
     baseline: StepResult | None = None
+    stepped = Trace()
     if options.baseline:
-        baseline = yield from stage("baseline", finished.baseline, lambda: _baseline(facts, point))
+        baseline = yield from stage("baseline", finished.baseline, lambda: _baseline(facts, point, stepped))
         if finished.baseline is None:
-            yield from to_rest(facts, point, 0.02 * facts.sp_deviation)
+            yield from to_rest(facts, point, 0.02 * facts.sp_deviation, stepped)
     gain = baseline.static_gain if baseline else math.nan
     step = Trace()
 
@@ -307,10 +308,20 @@ def _typed(value: float | None) -> float:
     return value
 
 
-def _baseline(facts: Facts, point: OperatingPoint) -> Plan[StepResult]:
-    """The set-point step under the accepted gains, for the comparison and for a first value of the static gain."""
+def _baseline(facts: Facts, point: OperatingPoint, trace: Trace) -> Plan[StepResult]:
+    """The set-point step under the accepted gains, for the comparison and for a first value of the static gain.
+
+    trace: is filled with the samples.
+    """
     step = allowed_step(facts, point, facts.old_gains.Kp, math.nan)
-    result = yield from step_test(facts, point, step, band=0.05, max_s=5 * facts.T95_s, smooth_s=facts.T95_s / 12)
+    result = yield from step_test(
+        facts, point, step, band=0.05, max_s=5 * facts.T95_s, smooth_s=facts.T95_s / 12, into=trace
+    )
+    if not result.settled:
+        text = f"PV has not settled within {result.duration_s:.3g} s of a set-point step of {step:.4g}"
+        found = held(facts, point, trace, text, Reason.NOT_SELF_REGULATING)
+        if found.reason is not Reason.NOT_SELF_REGULATING:
+            raise found
     if abs(result.static_gain) * facts.old_gains.Kp > MAX_GAIN:
         raise Refused(
             Reason.NOT_SELF_REGULATING,

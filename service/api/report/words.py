@@ -34,6 +34,7 @@ _REASONS = {
     Reason.PV_LIMIT: "PV left its limits",
     Reason.MV_LIMIT: "MV at its limit",
     Reason.NODE_LOST: "the node was lost",
+    Reason.NODE_NOT_ANSWERING: "the node did not answer",
     Reason.BUS_LOST: "the bus was lost",
     Reason.INTERNAL: "an error inside the service",
 }

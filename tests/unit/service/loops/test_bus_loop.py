@@ -100,6 +100,15 @@ class TestBeginning:
             site.loop.read()
         assert caught.value.reason is Reason.NODE_NOT_OPERATIONAL
 
+    @pytest.mark.parametrize("node", [CONTROLLER_NODE, PLANT_NODE])
+    def test_a_node_that_beats_and_answers_no_sdo_is_not_called_silent(self, site: Site, node: int) -> None:
+        device = site.controller if node == CONTROLLER_NODE else site.plant
+        site.let_run()
+        device.runtime.sdo.answer = lambda *args: None  # type: ignore[method-assign]
+        with pytest.raises(Failed, match=rf"{node:02X}h \({node}\) does not answer .*its heartbeat is heard") as caught:
+            site.loop.begin()
+        assert caught.value.reason is Reason.NODE_NOT_ANSWERING
+
     def test_a_trial_by_hand_is_nobody_elses_to_end(self, site: Site) -> None:
         site.let_run()
         site.hand("controller_staged_kp", 99.0)

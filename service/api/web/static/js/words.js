@@ -88,6 +88,7 @@ const REASONS = {
   pv_limit: "PV left its limits",
   mv_limit: "MV at its limit",
   node_lost: "node lost",
+  node_not_answering: "node does not answer",
   bus_lost: "bus lost",
   gateway_lost: "gateway does not answer",
   internal: "an error inside the service",
