@@ -40,6 +40,8 @@ class Reason(StrEnum):
     MV_LIMIT = "mv_limit"
     STALLED = "stalled"
     UNEXPLAINED = "unexplained"
+    PV_ALTERED = "pv_altered"
+    MV_ALTERED = "mv_altered"
     DISTURBED = "disturbed"
     UNCERTAIN = "uncertain"
     AMBIGUOUS = "ambiguous"
@@ -111,6 +113,11 @@ ADVICE: dict[Reason, str] = {
     Reason.UNEXPLAINED: "No linear model explains the record: look for a sticking valve, a limit, a gain that changes "
     "with MV (linearise the valve's characteristic, or permit less MV), another loop or several changes of the load, "
     "then retune.",
+    Reason.PV_ALTERED: "PV reaches the controller otherwise than the plant gives it: have the sensor, or what passes its "
+    "value on, renew it at every sample, unrounded and without wrong samples, or choose a sample time as long as its "
+    "interval, then retune.",
+    Reason.MV_ALTERED: "The plant gets another MV than the controller gives: choose a window that is short beside the "
+    "plant's dead time, a faster or finer actuator, or permit only as much MV as it follows, then retune.",
     Reason.DISTURBED: "Something slow moved PV during the test: wait for a steady time, then retune.",
     Reason.UNCERTAIN: "The record does not tell enough for this robustness: permit more MV, filter the measurement, or "
     "ask for a lower Ms.",

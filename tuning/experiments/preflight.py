@@ -10,6 +10,8 @@ import math
 
 import numpy as np
 
+from loopwright.tuning.analysis.pv_faults import pv_faults, without_wrong_samples
+from loopwright.tuning.analysis.window import swing_at_rest
 from loopwright.tuning.experiments.controller_mismatch import check_law_at_rest
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, record
 from loopwright.tuning.plan import Mode, Note, Plan, StageStarted
@@ -99,16 +101,28 @@ def check_at_rest(
         )
     slack = 4 * noise / math.sqrt(len(pv))
     if noise > MAX_NOISE * step:
-        raise Refused(Reason.NOISE_TOO_HIGH, f"noise {noise:.3g} is above {MAX_NOISE:.0%} of the step {step:.3g}")
+        text = f"noise {noise:.3g} is above {MAX_NOISE:.0%} of the step {step:.3g}"
+        raise _named(Reason.NOISE_TOO_HIGH, text, trace, facts)
     near_rest = MAX_AWAY * step
     if abs(drift) > near_rest + 4 * slack or abs(away) > near_rest + slack or spread > 0.03 * step + 2 * noise:
         off = f"is {away:+.3g} off the set-point and " if by_setpoint else "and "
-        raise Refused(
-            Reason.NOT_AT_REST,
+        text = (
             f"within {trace.t[-1] - trace.t[0]:.3g} s PV drifted by {drift:+.3g}, {off}varies by {spread:.3g} "
-            f"(noise {noise:.3g}); the step would be {step:.3g}",
+            f"(noise {noise:.3g}); the step would be {step:.3g}"
         )
+        raise _named(Reason.NOT_AT_REST, text, trace, facts)
     if by_setpoint:
         check_law_at_rest(facts, trace)
     room = min(room, 0.5 * facts.mv_step_max)
     return OperatingPoint(sample.sp, float(pv.mean()), float(mv.mean()), noise, room), trace
+
+
+def _named(reason: Reason, text: str, trace: Trace, facts: Facts) -> Refused:
+    """The refusal, which names single wrong samples of PV, or what swings it, before the noise that they would seem."""
+    pv = np.asarray(trace.pv)
+    if wrong := pv_faults(pv).of_wrong_samples:
+        without = float(np.std(np.diff(without_wrong_samples(pv)))) / math.sqrt(2)
+        return Refused(reason, f"{wrong}, where the noise is {without:.2g} without them: {text}")
+    if (swing := swing_at_rest(pv, np.asarray(trace.mv), facts.sample_time_s)) is None:
+        return Refused(reason, text)
+    return Refused(Reason.MV_ALTERED if swing.by_window else reason, f"{swing.in_words}: {text}")

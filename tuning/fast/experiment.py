@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from loopwright.tuning.analysis.pv_faults import without_wrong_samples
 from loopwright.tuning.experiments.control_record import ControlRecord, control_record
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
 from loopwright.tuning.fast.record import ExperimentRecord, noise_of
@@ -79,9 +80,10 @@ class Experiment:
         raise NotImplementedError
 
     def _deviations(self) -> tuple[Reals, Reals]:
-        """MV and PV of the record as deviations from their means at rest."""
+        """MV and PV of the record as deviations from their means at rest. Single wrong samples of PV are interpolated,
+        as lost ones are: what the controller made of them is in MV."""
         rest = slice(0, self.listened)
-        mv, pv = np.asarray(self.trace.mv), np.asarray(self.trace.pv)
+        mv, pv = np.asarray(self.trace.mv), without_wrong_samples(np.asarray(self.trace.pv))
         return mv - float(np.mean(mv[rest])), pv - float(np.mean(pv[rest]))
 
     def _tested(self) -> Trace:
@@ -99,9 +101,7 @@ class Experiment:
             return control_record(facts, trace, [(0, samples, facts.old_gains)])
         moved = np.flatnonzero(np.diff(trace.sp[self._steps[0] - 1 :]))
         begun = self._steps[0] + int(moved[0]) if len(moved) else samples
-        return control_record(
-            facts, trace, [(0, self.excited, facts.old_gains), (begun, samples, self._gains_tried)]
-        )
+        return control_record(facts, trace, [(0, self.excited, facts.old_gains), (begun, samples, self._gains_tried)])
 
     @property
     def _direction(self) -> float:

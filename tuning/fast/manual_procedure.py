@@ -21,6 +21,7 @@ from loopwright.tuning.fast.proposal import FastProposal, comparison_of, evaluat
 from loopwright.tuning.fast.record import MIN_LISTENED
 from loopwright.tuning.fast.record_evaluation import first_period
 from loopwright.tuning.fast.still_open import OPEN_REASONS
+from loopwright.tuning.fast.what_hides import naming_what_hides
 from loopwright.tuning.plan import Mode, Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -52,16 +53,24 @@ def by_manual(facts: Facts, options: DesignOptions, method: str) -> Plan[FastPro
     Raises Refused. The plan restores nothing: the runner restores the loop.
     """
     options.check_sampling(facts)
-    T95, spec = facts.T95_s, options.spec()
-    expected = {"preflight": T95 / 2, MANUAL: 1.5 * T95, "design": 0.0}
+    point, listened = yield from at_rest(facts, _expected_s(facts)[MANUAL], MIN_SAMPLES, Mode.MANUAL)
+    test = ManualTest(facts, point, listened)
+    return (yield from naming_what_hides(test, partial(_pulsed, facts, options, method, test)))
+
+
+def _expected_s(facts: Facts) -> dict[str, float]:
+    """The expected plant time of each stage, s."""
+    return {"preflight": facts.T95_s / 2, MANUAL: 1.5 * facts.T95_s, "design": 0.0}
+
+
+def _pulsed(facts: Facts, options: DesignOptions, method: str, test: ManualTest) -> Plan[FastProposal]:
+    T95, spec, expected = facts.T95_s, options.spec(), _expected_s(facts)
 
     def started(stage: str) -> tuple[StageStarted]:
         after = MANUAL_STAGES[MANUAL_STAGES.index(stage) + 1 :]
         return (StageStarted(stage, expected[stage], sum(expected[s] for s in after)),)
 
-    point, listened = yield from at_rest(facts, expected[MANUAL], MIN_SAMPLES, Mode.MANUAL)
-    test = ManualTest(facts, point, listened)
-    yield from test.report(StageDone("preflight", point), *started(MANUAL))
+    yield from test.report(StageDone("preflight", test.point), *started(MANUAL))
     yield from test.start()
     yield from test.first()
     test.period = yield from test.computed(partial(first_period, *test.columns(), facts.sample_time_s))

@@ -33,6 +33,7 @@ from loopwright.tuning.fast.proposal import (
 from loopwright.tuning.fast.record import MIN_LISTENED
 from loopwright.tuning.fast.relay_test import RelayTest
 from loopwright.tuning.fast.still_open import OPEN_REASONS, open_by, trial_may_tell
+from loopwright.tuning.fast.what_hides import naming_what_hides
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -106,6 +107,10 @@ def fast_by_relay(facts: Facts, options: FastOptions) -> Plan[FastProposal]:
 
 def by_relay(facts: Facts, options: FastOptions, experiment: RelayTest) -> Plan[FastProposal]:
     """The plan of the procedure from the relay on. Raises Refused."""
+    return (yield from naming_what_hides(experiment, partial(_by_relay, facts, options, experiment)))
+
+
+def _by_relay(facts: Facts, options: FastOptions, experiment: RelayTest) -> Plan[FastProposal]:
     spec = options.spec()
     todo = fast_stages(options.verify)
 

@@ -27,6 +27,7 @@ from loopwright.tuning.fast.pulse_test import PulseTest
 from loopwright.tuning.fast.pulses import TooLittleExcited, pulsed
 from loopwright.tuning.fast.record import MIN_LISTENED
 from loopwright.tuning.fast.still_open import OPEN_REASONS
+from loopwright.tuning.fast.what_hides import naming_what_hides
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Refused
 
@@ -62,17 +63,29 @@ def by_pulses(
     Raises Refused. The plan restores nothing: the runner restores the loop.
     """
     options.check_sampling(facts)
-    T95, spec = facts.T95_s, options.spec()
-    expected = {"preflight": T95 / 2, "pulses": T95, "design": 0.0, "verify": 1.5 * T95, "redesign": 0.0}
-    todo = setpoint_stages(options.verify)
+    after = (_expected_s(facts)[stage] for stage in setpoint_stages(options.verify)[1:])
+    point, listened = yield from at_rest(facts, sum(after), MIN_SAMPLES)
+    test = PulseTest(facts, point, listened)
+    yield from test.report(StageDone("preflight", point))
+    plan = partial(_tested, facts, options, test, method, relay_follows)
+    return (yield from naming_what_hides(test, plan))
+
+
+def _expected_s(facts: Facts) -> dict[str, float]:
+    """The expected plant time of each stage, s."""
+    T95 = facts.T95_s
+    return {"preflight": T95 / 2, "pulses": T95, "design": 0.0, "verify": 1.5 * T95, "redesign": 0.0}
+
+
+def _tested(
+    facts: Facts, options: DesignOptions, test: PulseTest, method: str, relay_follows: bool
+) -> Plan[FastProposal]:
+    spec, expected, todo = options.spec(), _expected_s(facts), setpoint_stages(options.verify)
 
     def started(stage: str) -> tuple[StageStarted]:
         after = todo[todo.index(stage) + 1 :]
         return (StageStarted(stage, expected[stage], sum(expected[s] for s in after)),)
 
-    point, listened = yield from at_rest(facts, sum(expected[stage] for stage in todo[1:]), MIN_SAMPLES)
-    test = PulseTest(facts, point, listened)
-    yield from test.report(StageDone("preflight", point))
     check_ramp(facts, test.noise)
     yield from test.report(*started("pulses"))
     look = yield from pulsed(test, options, relay_follows)
@@ -110,4 +123,3 @@ def by_pulses(
         comparison = outcome
     begun_at_s = test.trace.t[test.listened]
     return (yield from test.computed(partial(proposed, method, facts, spec, evaluation, comparison, shown, begun_at_s)))
-

@@ -1,0 +1,222 @@
+"""What the plant gets in place of the MV that the controller gives, as far as a record shows it: an MV that moves no
+faster than a rate, is switched on and off in a window, or is taken in steps.
+
+The model is fitted to what the plant would get then. A fault is believed where it explains the record, and better than
+any model of a sound actuator, another fault of a valve or a gain that changes does: those look alike under a few moves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loopwright.tuning.analysis.window import PHASES, lengths, switched
+from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.score_tests import ScoreTests, above_rest, cubed, squared
+from loopwright.tuning.fast.valve_faults import backlash, saturation, stiction
+from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN, by_bic, fit_structures
+from loopwright.tuning.identification.output_error import UNDISTURBED, Fit, Fitted
+from loopwright.tuning.identification.structures import SECOND, SECOND_WITH_ZERO, THIRD, Structure
+from loopwright.tuning.models import Reals
+
+RATE_RATIO = 1.12
+SLOWEST, FASTEST = 1.5, 2.0
+"""Times that MV's largest move takes at the slowest rate that is tried, in periods, and at the fastest, in samples."""
+FINEST, COARSEST, STEP_PHASES = 0.05, 1.2, 8
+"""The finest and the coarsest step of MV that is tried, as parts of MV's largest move, and how many places of the first
+step."""
+LONGEST_WINDOW = 0.7
+"""Of the windows that are tried, in periods."""
+SIZES = 1.25 ** np.arange(-17, 0)
+"""Sizes of other faults of a valve that are tried, as parts of MV's largest move."""
+SHARES = (-0.6, -0.3, -0.15, 0.15, 0.3, 0.6, 1.0, 2.0)
+"""By how much a gain that changes may do so."""
+CLEAR = 16.0
+"""By how much a fault has to lower chi-squared in a score test to be fitted."""
+FITTED, REFINED = 3, 6
+"""How many sizes of each kind are fitted, and how often the best is refined."""
+STRUCTURES: tuple[Structure, ...] = (SECOND, SECOND_WITH_ZERO, THIRD)
+STEPS = 8
+RIVAL = 10.0
+"""By how much BIC of the fault must be below that of any other kind."""
+EXPLAINED = 1.6, 0.006
+"""Largest residual by which a fault explains the record: in standard deviations of the noise at rest, or as a part of
+PV's range. A sound actuator has to leave less (`evaluation`): what is said here is a reason, no model."""
+
+
+@dataclass(frozen=True, slots=True)
+class MvFault:
+    """What the plant gets in place of MV.
+
+    what: in words, with its size. bic_gain: by how much it lowers BIC below the best model of a sound actuator.
+    """
+
+    what: str
+    bic_gain: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Tried:
+    """A fault of one size: what it makes of MV in the record.
+
+    kind: of the fault; those that begin with "other" are not named here. size: what `_near` refines. u: MV units,
+    shape (N,).
+    """
+
+    kind: str
+    size: tuple[float, ...]
+    u: Reals
+
+
+def find_mv_fault(fit: Fit[ExperimentRecord], best: Fitted, mv_at_rest: float) -> MvFault | None:
+    """What the plant gets in place of MV, None where the record does not show it.
+
+    best: the best model without such a fault. mv_at_rest: MV units.
+    """
+    record = fit.record
+    if len(record.pieces) > 1:
+        return None
+    (plain,) = fit_structures(fit, UNDISTURBED, structures=(SECOND,))
+    tests = ScoreTests(fit, plain)
+    likeliest: dict[str, tuple[Fitted, _Tried]] = {}
+    for kind in _kinds(record, mv_at_rest):
+        tried = list(kind)
+        if not tried:
+            continue
+        shares, deviations = tests.scores(np.array([each.u for each in tried]) - record.u)
+        decrease = np.where(np.isfinite(deviations), (2.0 * shares - 1.0) / np.square(deviations), 0.0)
+        ranked = np.argsort(-decrease)
+        if not decrease[ranked[0]] > CLEAR:
+            continue
+        some = [tried[i] for i in _distinct(ranked, tried)]
+        likeliest[tried[0].kind] = _refined(record, mv_at_rest, plain, some)
+    named = {kind: each for kind, each in likeliest.items() if not kind.startswith("other")}
+    if not named:
+        return None
+    found, fault = min(named.values(), key=lambda each: each[0].bic)
+    others = [each.bic for kind, (each, _) in likeliest.items() if kind != fault.kind]
+    noise, least = EXPLAINED
+    explained = found.rms <= max(noise * record.noise / record.output_range, least)
+    gain = best.bic - found.bic
+    if not explained or gain < MIN_BIC_GAIN or found.bic > min(others, default=math.inf) - RIVAL:
+        return None
+    return MvFault(_in_words(fault, record), gain)
+
+
+def _kinds(record: ExperimentRecord, mv_at_rest: float) -> Iterator[Iterator[_Tried]]:
+    move = float(np.ptp(record.u))
+    count = math.log(max(SLOWEST * record.period / FASTEST, 1.0)) / math.log(RATE_RATIO)
+    slowest = move / (SLOWEST * record.period)
+    yield (_rate(record, slowest * RATE_RATIO**k) for k in range(round(count)))
+    steps = move / np.arange(1.0 / COARSEST, 1.0 / FINEST, 0.25)
+    yield (_steps(record, step, step * k / STEP_PHASES) for step in steps.tolist() for k in range(STEP_PHASES))
+    yield (
+        each
+        for length in lengths(record.y[: record.listened], record.Ts, LONGEST_WINDOW * record.period)
+        for k in range(PHASES)
+        for each in _window(record, mv_at_rest, length, length * k / PHASES)
+    )
+    for fault in (backlash, stiction, saturation):
+        yield (
+            _Tried(f"other {fault.__name__}", (size,), record.input_range * fault(record.u / record.input_range, size))
+            for size in SIZES
+        )
+    for change in (above_rest, squared, cubed):
+        yield (_Tried(f"other {change.__name__}", (share,), record.u + share * change(record)) for share in SHARES)
+
+
+def _refined(
+    record: ExperimentRecord, mv_at_rest: float, plain: Fitted, some: Sequence[_Tried]
+) -> tuple[Fitted, _Tried]:
+    """The best fit of one kind, and its size."""
+    thetas: dict[Structure, Reals] = {}
+
+    def fitted(each: _Tried, structures: Sequence[Structure] = (SECOND,)) -> Fitted:
+        moved = Fit(replace(record, u=each.u))
+        if structures[0] in thetas and len(structures) == 1:
+            return moved.search(structures[0], UNDISTURBED, [thetas[structures[0]]], STEPS)
+        return min(fit_structures(moved, UNDISTURBED, structures=structures), key=by_bic)
+
+    found, fault = min(((fitted(each), each) for each in some), key=lambda each: each[0].bic)
+    thetas[plain.structure] = found.theta
+    finer = 1.0
+    for _ in range(REFINED):
+        before = fault
+        for each in _near(record, mv_at_rest, fault, finer):
+            again = fitted(each)
+            if again.bic < found.bic:
+                found, fault = again, each
+                thetas[plain.structure] = found.theta
+        if fault is before:
+            finer *= 0.4
+    last = fitted(fault, STRUCTURES)
+    return (last if last.bic < found.bic else found), fault
+
+
+def _distinct(ranked: Sequence[int], tried: Sequence[_Tried]) -> list[int]:
+    """The likeliest sizes, as many as are fitted, none a neighbour of another."""
+    kept: list[int] = []
+    for i in ranked:
+        if all(abs(i - k) > 1 for k in kept):
+            kept.append(int(i))
+        if len(kept) == FITTED:
+            break
+    return kept
+
+
+def _near(record: ExperimentRecord, mv_at_rest: float, fault: _Tried, finer: float) -> Iterator[_Tried]:
+    """Sizes near one."""
+    if fault.kind == "rate":
+        (rate,) = fault.size
+        yield from (_rate(record, rate * RATE_RATIO ** (sign * finer * 0.7)) for sign in (-1.0, 1.0))
+    elif fault.kind == "steps":
+        step, first = fault.size
+        move = float(np.ptp(record.u))
+        for turned in (-finer, finer):
+            yield _steps(record, move / (move / step + 0.12 * turned), first)
+            yield _steps(record, step, first + turned * step / STEP_PHASES / 2.0)
+    elif fault.kind == "window":
+        length, begin = fault.size
+        turned = length / PHASES * finer
+        off = length**2 / len(record.u) / 4.0 * finer
+        for more, later in ((0.0, turned), (0.0, -turned), (off, 0.0), (-off, 0.0)):
+            yield from _window(record, mv_at_rest, length + more, begin + later)
+
+
+def _rate(record: ExperimentRecord, rate: float) -> _Tried:
+    """rate: MV units a sample. The mean over each sample of where such an actuator is."""
+    at, found = float(record.u[0]), []
+    for value in record.u.tolist():
+        way = min(max(value - at, -rate), rate)
+        # it arrives within the sample where the way is shorter than the rate
+        found.append(at + way * (1.0 - 0.5 * abs(way) / rate))
+        at += way
+    return _Tried("rate", (rate,), np.array(found))
+
+
+def _steps(record: ExperimentRecord, step: float, first: float) -> _Tried:
+    """first: a level, MV units from rest."""
+    u = step * np.round((record.u - first) / step)
+    return _Tried("steps", (step, first), np.asarray(u - np.mean(u[: record.listened])))
+
+
+def _window(record: ExperimentRecord, mv_at_rest: float, length: float, begin: float) -> Iterator[_Tried]:
+    """length, begin: samples."""
+    for latched in (True, False):
+        mv = switched(record.u + mv_at_rest, length, begin, latched)
+        if mv is not None:
+            yield _Tried("window", (length, begin), mv - mv_at_rest)
+
+
+def _in_words(fault: _Tried, record: ExperimentRecord) -> str:
+    if fault.kind == "rate":
+        rate = fault.size[0] / record.Ts
+        asked, reached = float(np.max(np.abs(record.u))), float(np.max(np.abs(fault.u)))
+        text = f"MV moves no faster than about {rate:.2g} a second on its way to the plant"
+        return f"{text}: of {asked:.3g} away from rest it reached {reached:.3g}" if reached < 0.98 * asked else text
+    if fault.kind == "steps":
+        return f"MV reaches the plant in steps of about {fault.size[0]:.2g}"
+    return f"MV is switched on and off in a window of {fault.size[0] * record.Ts:.3g} s"
