@@ -246,9 +246,9 @@ def _session() -> tuple[Object, ...]:
          {"default": 1000, "low": 1, "unit": "ms"}),
         ("session_watch_ms", U32, "rw", "Time without the tuner's heartbeat that ends the session, staged",
          {"default": 1000, "low": 1, "unit": "ms"}),
-        ("home_mode", U8, "ro", "Mode at the opening", {}),
+        ("home_mode", U8, "ro", "Mode at the opening (manual after HOLD)", {}),
         ("home_setpoint", REAL32, "ro", "Set-point at the opening", {}),
-        ("home_manual_output", REAL32, "ro", "Manual output at the opening", {"unit": "%"}),
+        ("home_manual_output", REAL32, "ro", "Manual output at the opening (home MV after HOLD)", {"unit": "%"}),
         ("home_mv", REAL32, "ro", "MV at the opening", {"unit": "%"}),
     )
     return tuple(

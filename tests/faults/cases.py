@@ -13,6 +13,10 @@ from tests.faults.stand import Needs
 
 BOTH = ("sqlite", "postgresql")
 IN_MANUAL = tuple(name for name, stage in STAGES.items() if stage.in_manual)
+PV_STAGES = ("fast-relay", "fast-verify", "setpoint-pulses", "setpoint-verify")
+"""Stages that move the loop."""
+NOISY = Needs(noise=0.002)
+"""Noise tells whether PV is false: 2 % of the permitted step."""
 ONE_PHASE = tuple(name for name in STAGES if name not in IN_MANUAL[1:])
 """For faults of the database and the like: to them all phases of a pulse of the manual output are the same."""
 
@@ -66,6 +70,8 @@ FAULTS = {
     "off-way-out": Fault("the operator's OFF on the way out", do.off_on_the_way_out),
     "pre-operational": Fault("a third node makes the controller pre-operational", do.pre_operational),
     "pv-gone": Fault("PV is no number for good", do.pv_gone),
+    "pv-frozen": Fault("PV stands still within its limits for good", do.pv_false(None), PV_STAGES, needs=NOISY),
+    "pv-jumps": Fault("PV jumps within its limits and stays there", do.pv_false(-0.6), PV_STAGES, needs=NOISY),
     "two-tuners": Fault(
         "another tuner wants the loop", do.two_tuners, ("relay", "verify", "fast-relay", "setpoint-pulses", "manual-up")
     ),

@@ -60,7 +60,10 @@ class FaultyHub(Hub):
         """The number of the sample in which a tuner has last given an order within its session."""
         self.pv_broken = False
         """The transmitter of channel 1 gives no number."""
-        self._pv = math.nan
+        self.shows: Callable[[float], float] | None = None
+        """What the transmitter of channel 1 makes of PV; None: it shows PV."""
+        self.pv = math.nan
+        """The latest one, as it was shown."""
         self._taken = self._held = False
         self._onlooker: _Member | None = None
         self._late: list[tuple[float, _Member, bytes]] = []
@@ -87,6 +90,10 @@ class FaultyHub(Hub):
         words = frame.split()
         can_id = int(words[2], 16)
         data = words[4] if len(words) > 5 else b""
+        if can_id == _PV and len(data) == 2 * PV_FRAME.size and self.shows is not None:
+            pv, number = PV_FRAME.unpack(bytes.fromhex(data.decode()))
+            shown = PV_FRAME.pack(self.shows(pv), number).hex().upper().encode()
+            frame, data = frame.replace(data, shown), shown
         self._witness(can_id, data)
         if self.pv_broken and can_id == _PV and len(data) == 2 * PV_FRAME.size:
             frame = frame.replace(data, _NO_NUMBER + data[8:])
@@ -111,11 +118,11 @@ class FaultyHub(Hub):
             mv, number = MV_FRAME.unpack(bytes.fromhex(data.decode()))
             if number == self.sample_number:
                 self.answered = number
-                self.samples.setdefault(number, []).append((self._pv, mv))
+                self.samples.setdefault(number, []).append((self.pv, mv))
 
     def _witness(self, can_id: int, data: bytes) -> None:
         if can_id == _PV and len(data) == 2 * PV_FRAME.size:
-            self._pv, self.sample_number = PV_FRAME.unpack(bytes.fromhex(data.decode()))
+            self.pv, self.sample_number = PV_FRAME.unpack(bytes.fromhex(data.decode()))
             if self._taken:
                 self._taken, self.first_of_session = False, self.sample_number
                 self.samples.clear()

@@ -329,6 +329,30 @@ def pv_gone(stand: Stand, url: str) -> Harm:
     stand.hub.pv_broken = False
 
 
+def pv_false(by: float | None) -> Injection:
+    """PV is false within its limits from now on: it stands still, or is off by `by`."""
+
+    def inject(stand: Stand, url: str) -> Harm:
+        last, true = stand.hub.pv, stand.hub.shows or float
+        stand.hub.shows = (lambda pv: last) if by is None else (lambda pv: true(pv) + by)
+        yield replace(stand.home, mode=Mode.MANUAL, words="held in manual", mv=None)
+        stand.hub.shows = None
+        if abs(stand.eye.read("controller_manual_output") - (stand.home.mv or 0.0)) > LEFT_NEAR:
+            stand.defects.append(f"held at MV {stand.eye.read('controller_manual_output')}, not near {stand.home.mv}")
+        reason = stand.site.job(url)["reason"]
+        if reason not in (Reason.PV_FROZEN, Reason.BAD_SAMPLE):
+            stand.defects.append(f"PV was false, and the job ended as {reason}")
+        answer = stand.site.http.post(f"/loops/{TAG}/retune", json={})
+        if (answer.status_code, answer.json().get("reason")) != (409, Reason.NOT_ACKNOWLEDGED):
+            stand.defects.append(f"the next retune was answered with {answer.status_code} {answer.text}")
+        if answer.status_code == 202:
+            stand.site.http.post(f"{answer.headers['location']}/abort")
+            stand.site.finished(answer.headers["location"])
+        stand.site.http.post(f"/loops/{TAG}/dismiss", json={"by": "operator"})
+
+    return contextmanager(inject)
+
+
 def _look_at_mv(stand: Stand) -> None:
     """Nothing controls: MV must be that of home."""
     seen = stand.eye.glance()

@@ -12,6 +12,7 @@ import threading
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from random import Random
 from typing import NamedTuple
 
 import httpx
@@ -52,6 +53,8 @@ class Needs:
     small_disk: bool = False
     own_clock: bool = False
     defect: bool = False
+    noise: float = 0.0
+    """Of PV, PV units."""
 
 
 class Missing(Exception):
@@ -62,7 +65,7 @@ class Stand:
     """Closed by the stack it was made with. Raises Missing."""
 
     def __init__(self, stack: ExitStack, folder: Path, database: str = "sqlite", needs: Needs | None = None) -> None:
-        needs = needs or Needs()
+        self.needs = needs = needs or Needs()
         self.folder = folder
         self.defects: list[str] = []
         self.left: list[StoredSample] | None = None
@@ -103,9 +106,12 @@ class Stand:
         self.site.case = LOOP
 
     def at_rest(self, pace: float) -> None:
-        self.hub.fault, self.hub.pv_broken = well, False
+        self.hub.fault, self.hub.pv_broken, self.hub.shows = well, False, None
         self.site.at_rest(pace)
         self.hub.new_job()
+        if self.needs.noise:
+            draw = Random(1).gauss
+            self.hub.shows = lambda pv: pv + draw(0.0, self.needs.noise)
         self.home = HOME
         self.defective.unlink(missing_ok=True)
         self.defects.clear()
