@@ -76,7 +76,7 @@ LONGEST_REST = 20_000
 class PvAtRest:
     """What PV does at rest.
 
-    samples: their number.  value: the mean, PV units.
+    samples: their number.  value, last: the mean and the last of them, PV units; nan where there is none.
     longest_run: the largest number of samples in a row that were exactly equal.
     renewal: the number of samples from one new value to the next.
     noise: the standard deviation of PV around a mean that stands still, PV units; the larger of that by differences and
@@ -90,6 +90,7 @@ class PvAtRest:
 
     samples: int
     value: float
+    last: float
     longest_run: int
     renewal: int
     noise: float
@@ -107,7 +108,7 @@ class PvAtRest:
         n = len(x)
         if n < 2:
             value = float(x[0]) if n else math.nan
-            return cls(n, value, n, 1, 0.0, 0.0, 0.0, 0.0, 0.0, None, (0.0,) * len(WINDOWS))
+            return cls(n, value, value, n, 1, 0.0, 0.0, 0.0, 0.0, 0.0, None, (0.0,) * len(WINDOWS))
         edges = np.flatnonzero(np.diff(x)) + 1
         runs = np.diff([0, *edges, n])
         longest = int(runs.max())
@@ -140,6 +141,7 @@ class PvAtRest:
         return cls(
             samples=n,
             value=float(np.mean(x)),
+            last=float(x[-1]),
             longest_run=longest,
             renewal=renewal,
             noise=noise,
@@ -196,7 +198,7 @@ class PvWatch:
         self._low, self._high = mv_low, mv_high
         self._hair = 1e-3 * abs(mv_high - mv_low) if math.isfinite(mv_high - mv_low) else 0.0
         self._n = 0
-        self._last = math.nan
+        self._last = rest.last
         self._run = 1
         self._longest_run = 0
         """The longest run since the first move of MV that PV has ended."""
@@ -241,7 +243,7 @@ class PvWatch:
                 self._answer_due = self._n
 
     def _ends_run(self, pv: float) -> None:
-        if self._n > 1:
+        if not math.isnan(self._last):
             self._longest_run = max(self._longest_run, self._run)
             self._changes.append((pv - self._last, self._run))
         self._run, self._answer_due = 1, None
@@ -290,8 +292,8 @@ class PvWatch:
         for window, least in zip(WINDOWS, rest.least_variances, strict=True):
             if window > count:
                 break
-            if not least:
-                continue
+            if not least or self._run > (window - 1) * rest.renewal:
+                continue  # equal values are told as such
             total = sums[-1] - sums[-1 - window]
             variance = (squares[-1] - squares[-1 - window] - total * total / window) / (window - 1)
             if variance < least:
@@ -335,7 +337,7 @@ class PvWatch:
         if self._jump is not None:
             self._go_on_with_jump(self._jump, pv)
             return
-        if self._n < 2:
+        if math.isnan(self._last):
             return
         move = pv - self._last
         known = rest.lively or len(self._changes) == STEADY_CHANGES
