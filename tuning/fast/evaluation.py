@@ -153,7 +153,7 @@ def evaluate(
     if reason is None and _stand_for_a_curve(record, found):
         what = "two load disturbances within one test explain the record"
         reason, detail = Reason.DISTURBED, f"{what}; a plant that is not linear would look the same"
-    if reason in LIKE_TWO_LAGS and not (test_follows and unexplained is None):
+    if reason in LIKE_TWO_LAGS:
         lags = find_two_lags(fit, found)
         reason, detail = (reason, detail) if lags is None else (Reason.UNEXPLAINED, lags.what)
     if reason is None and kept is None:

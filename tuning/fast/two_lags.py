@@ -29,12 +29,12 @@ from loopwright.tuning.identification.regressors import Regressors
 from loopwright.tuning.identification.variable_projection import SearchBounds
 from loopwright.tuning.models import Reals
 
-LAGS, RATIOS, SECOND_LAGS = (0.3, 0.8, 2.0, 6.0), (0.4, 1.0, 2.5), (0.02, 0.2)
-DEAD_TIMES = (0.1, 0.25, 0.4)
+LAGS, RATIOS, SECOND_LAGS = (0.3, 0.8, 2.0, 6.0), (0.2, 0.45, 1.0, 2.2, 5.0), (0.02, 0.2)
+DEAD_TIMES = (0.05, 0.15, 0.3)
 """First guesses: of the lags and dead times in periods, of the lag of falling over that of rising."""
 SHORTEST, LONGEST = 0.005, 40.0
 """Lags that are searched, in periods."""
-STARTS = 3
+STARTS = 5
 MIN_RATIO = 1.1
 """Smallest ratio of the two lags that is named."""
 
