@@ -130,9 +130,7 @@ def main() -> None:
 
 
 def _line(name: str, count: Count) -> str:
-    return (
-        f"| {name} | {count.runs} | {count.checks} | {count.samples} | {count.roundings:.2f} | {count.mismatches} |"
-    )
+    return f"| {name} | {count.runs} | {count.checks} | {count.samples} | {count.roundings:.2f} | {count.mismatches} |"
 
 
 if __name__ == "__main__":

@@ -113,8 +113,8 @@ ADVICE: dict[Reason, str] = {
     Reason.UNEXPLAINED: "No linear model explains the record: look for a sticking valve, a limit, a gain that changes "
     "with MV (linearise the valve's characteristic, or permit less MV), another loop or several changes of the load, "
     "then retune.",
-    Reason.PV_ALTERED: "PV reaches the controller otherwise than the plant gives it: have the sensor, or what passes its "
-    "value on, renew it at every sample, unrounded and without wrong samples, or choose a sample time as long as its "
+    Reason.PV_ALTERED: "PV reaches the controller otherwise than the plant gives it: have the sensor, or what passes "
+    "its value on, renew it at every sample, finely and without wrong samples, or choose a sample time as long as its "
     "interval, then retune.",
     Reason.MV_ALTERED: "The plant gets another MV than the controller gives: choose a window that is short beside the "
     "plant's dead time, a faster or finer actuator, or permit only as much MV as it follows, then retune.",

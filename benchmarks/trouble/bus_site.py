@@ -125,8 +125,7 @@ class TroubleSite:
                 raise RuntimeError(f"{len(waits)} jobs have not ended in {PATIENCE_S:g} s, see {self._folder}")
             time.sleep(LOOK_S)
         return [
-            (each, self._http.get(each.url).json(), self._http.get(f"{each.url}/samples").json())
-            for each in self.loops
+            (each, self._http.get(each.url).json(), self._http.get(f"{each.url}/samples").json()) for each in self.loops
         ]
 
     def _drifts(self, loop: BusLoop) -> bool:

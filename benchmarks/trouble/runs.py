@@ -105,9 +105,7 @@ class TroubledLoop(RehearsedLoop):
         return stored.experiment_record() if stored else None
 
     def step(self, commands: Sequence[Command]) -> Sample:
-        begins = any(
-            isinstance(each, SetSetpoint | SetOutput) or each == SetMode(Mode.EXPERIMENT) for each in commands
-        )
+        begins = any(isinstance(each, SetSetpoint | SetOutput) or each == SetMode(Mode.EXPERIMENT) for each in commands)
         if begins and not self._begun:
             self._begun = True
             self.plant.begin()

@@ -81,3 +81,18 @@ class Quantised(Part):
 
     def step(self, value: float) -> float:
         return round(value / self._quantum) * self._quantum
+
+
+class Wrong(Part):
+    """Single samples, one in so many, that are wrong by a third of `by` to all of it, to either side."""
+
+    def __init__(self, setting: Setting, one_in: int, by: float) -> None:
+        self._random, self._one_in, self._by = setting.random(4), one_in, by
+        self._last = 0
+
+    def step(self, value: float) -> float:
+        self._last += 1
+        if self._last < 3 or self._random.random() * self._one_in > 1.0:
+            return value
+        self._last = 0
+        return value + self._by * float(self._random.uniform(0.33, 1.0)) * float(self._random.choice((-1.0, 1.0)))

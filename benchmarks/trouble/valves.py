@@ -166,6 +166,37 @@ class TimeProportioned(Part):
         return [delayed(self._late_s)]
 
 
+class Switched(Part):
+    """On or off, on for the first part of each window of so many Pu, as large as MV at its beginning.
+
+    rest: MV at rest, percent. For small moves it comes as late as it is switched off at rest.
+    """
+
+    def __init__(self, setting: Setting, length: float, rest: float) -> None:
+        self._window, self._rest, self._n, self._on = setting.steps(length), rest, 0, 0.0
+        self._late_s = rest / 100.0 * length * setting.plant.Pu
+
+    def step(self, value: float) -> float:
+        into = self._n % self._window
+        if into == 0:
+            self._on = (self._rest + value) / 100.0 * self._window
+        self._n += 1
+        return 100.0 * min(max(self._on - into, 0.0), 1.0) - self._rest
+
+    def linearisations(self) -> list[Response]:
+        return [delayed(self._late_s)]
+
+
+class Stepped(Part):
+    """In steps of this size. rest: MV at rest, percent."""
+
+    def __init__(self, setting: Setting, step: float, rest: float) -> None:
+        self._step, self._rest = step, rest
+
+    def step(self, value: float) -> float:
+        return self._step * round((value + self._rest) / self._step) - self._rest
+
+
 class Transport(Part):
     """What enters leaves when as much has followed; MV moves the flow, so the dead time falls by `fall` for 10 %."""
 

@@ -85,9 +85,7 @@ class InvalidValue(BaseModel):
 class Problem(BaseModel):
     """RFC 9457 problem details."""
 
-    type: str = Field(
-        description=f"URI of the kind of problem: {TYPE} and the reason", examples=[f"{TYPE}loop_busy"]
-    )
+    type: str = Field(description=f"URI of the kind of problem: {TYPE} and the reason", examples=[f"{TYPE}loop_busy"])
     title: str = Field(description="Title of the HTTP status", examples=["Conflict"])
     status: int = Field(description="HTTP status", examples=[409])
     detail: str = Field(

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from loopwright.service.execution.rehearsal import Rehearsal
 
 
-
 def follow(client: Client, job_url: str, to: Console | None = None) -> JobView:
     """Shows the progress of a job until the job is over; returns the job.
 
@@ -218,5 +217,3 @@ def doing(job: JobView) -> str:
     if job.state is not JobState.RUNNING:
         return job.state
     return " ".join(filter(None, (f"{job.state}:", job.stage, f"{job.progress:.0%}")))
-
-

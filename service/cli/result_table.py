@@ -143,9 +143,7 @@ def _predicted(job: ShownResult, pv_unit: str, mv_unit: str) -> Iterator[tuple[s
     yield "J, the cost minimised", cell(compared.J_before), cell(compared.J_after), ""
 
 
-def _model(
-    model: ModelView | TransferModelView | None, pv_unit: str, mv_unit: str
-) -> Iterator[tuple[str, str, str]]:
+def _model(model: ModelView | TransferModelView | None, pv_unit: str, mv_unit: str) -> Iterator[tuple[str, str, str]]:
     """Yields lines of the table: label, value, unit."""
     if model is None:
         return

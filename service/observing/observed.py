@@ -50,6 +50,8 @@ ADVICE = {
     Reason.DISTURBED: "Wait for set-point changes in steadier times, or retune by setpoint or fast.",
     Reason.UNEXPLAINED: "Look for a sticking valve, a limit of MV or another loop; then wait for further set-point "
     "changes, or retune by fast.",
+    Reason.PV_ALTERED: "Have the sensor, or what passes its value on, renew it at every sample, unrounded and without "
+    "wrong samples; then wait for further set-point changes, or retune by fast.",
     Reason.NOT_POSSIBLE: "Ask for what the message says is possible.",
     Reason.NOT_ROBUST: "Keep the present gains, or retune by fast.",
 }

@@ -10,7 +10,15 @@ from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 from loopwright.tuning.reasons import Reason
 
 FoundModel = FOPDT | SOPDT | TransferFunction
-DISPROVED = (Reason.WRONG_SIGN, Reason.MODEL_MISMATCH, Reason.DIVERGES, Reason.UNEXPLAINED, Reason.DISTURBED)
+DISPROVED = (
+    Reason.WRONG_SIGN,
+    Reason.MODEL_MISMATCH,
+    Reason.DIVERGES,
+    Reason.UNEXPLAINED,
+    Reason.PV_ALTERED,
+    Reason.MV_ALTERED,
+    Reason.DISTURBED,
+)
 """Reasons for which a job ends when its record contradicts the model that an earlier stage found."""
 
 

@@ -262,9 +262,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         looking = stack.enter_context(
             closing(Looking(jobs.directory, jobs.registry, store, listening, jobs.knowledge, pool))
         )
-        watching = stack.enter_context(
-            closing(Watching(store, jobs.directory, jobs.decisions, listening, pool))
-        )
+        watching = stack.enter_context(closing(Watching(store, jobs.directory, jobs.decisions, listening, pool)))
         others = OtherGateways(store)
         alarms = stack.enter_context(closing(AlarmWatch(jobs, listening, others)))
         own = OwnGateway(jobs, listening, setup.url, alarms)

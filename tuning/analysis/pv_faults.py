@@ -34,7 +34,7 @@ white noise reaches 5 in a million samples."""
 MOVES = 4.0
 """Distance of a wrong sample from its neighbours, in usual changes of PV from one sample to the next."""
 ALONE = 3.0
-"""Distance of a wrong sample from its neighbours, in ranges of these."""
+"""Distance of a wrong sample from the line through its neighbours, in the largest distance of these but one."""
 MAX_WRONG = 0.06
 """Largest part of the samples that may be wrong one by one: more of them are no single ones."""
 
@@ -101,10 +101,13 @@ def wrong_samples(pv: Reals) -> tuple[NDArray[np.int64], float]:
     width = 2 * NEIGHBOURS + 1
     padded = np.concatenate((pv[NEIGHBOURS:0:-1], pv, pv[-2 : -NEIGHBOURS - 2 : -1]))
     windows = np.lib.stride_tricks.sliding_window_view(padded, width)
-    others = np.sort(np.delete(windows, NEIGHBOURS, axis=1), axis=1)
-    away = pv - np.median(others, axis=1)
-    # of two wrong samples within a window one is left out on either side of what the others are
-    spread = others[:, -2] - others[:, 1]
+    left, right = (np.median(each, axis=1) for each in (windows[:, :NEIGHBOURS], windows[:, NEIGHBOURS + 1 :]))
+    places = np.arange(-NEIGHBOURS, NEIGHBOURS + 1.0)
+    line = 0.5 * (left + right)[:, None] + (right - left)[:, None] / (NEIGHBOURS + 1.0) * places
+    off = windows - line
+    away = off[:, NEIGHBOURS]
+    # another wrong sample may be among the neighbours
+    spread = np.sort(np.abs(np.delete(off, NEIGHBOURS, axis=1)), axis=1)[:, -2]
     scale = 1.4826 * float(np.median(np.abs(away)))
     moved = np.abs(np.diff(pv))
     # a PV that is sent only where it has changed, or rounded, moves by no less than that
@@ -126,7 +129,7 @@ def without_wrong_samples(pv: Reals) -> Reals:
     if not len(wrong):
         return pv
     right = np.setdiff1d(np.arange(len(pv)), wrong)
-    return np.interp(np.arange(len(pv), dtype=float), right.astype(float), pv[right])
+    return np.asarray(np.interp(np.arange(len(pv), dtype=float), right.astype(float), pv[right]))
 
 
 def rounding_step(pv: Reals) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from loopwright.tuning.analysis.window import PHASES, lengths, switched
 from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.fast.score_tests import ScoreTests, above_rest, cubed, squared
-from loopwright.tuning.fast.valve_faults import backlash, saturation, stiction
+from loopwright.tuning.fast.valve_faults import Fault, backlash, saturation, stiction
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN, by_bic, fit_structures
 from loopwright.tuning.identification.output_error import UNDISTURBED, Fit, Fitted
 from loopwright.tuning.identification.structures import SECOND, SECOND_WITH_ZERO, THIRD, Structure
@@ -25,23 +25,27 @@ from loopwright.tuning.models import Reals
 RATE_RATIO = 1.12
 SLOWEST, FASTEST = 1.5, 2.0
 """Times that MV's largest move takes at the slowest rate that is tried, in periods, and at the fastest, in samples."""
-FINEST, COARSEST, STEP_PHASES = 0.05, 1.2, 8
+FINEST, COARSEST, STEP_PHASES = 0.07, 1.2, 8
 """The finest and the coarsest step of MV that is tried, as parts of MV's largest move, and how many places of the first
 step."""
 LONGEST_WINDOW = 0.7
 """Of the windows that are tried, in periods."""
 SIZES = 1.25 ** np.arange(-17, 0)
 """Sizes of other faults of a valve that are tried, as parts of MV's largest move."""
-SHARES = (-0.6, -0.3, -0.15, 0.15, 0.3, 0.6, 1.0, 2.0)
+SHARES = (-0.6, -0.4, -0.25, -0.15, -0.1, -0.05, 0.05, 0.1, 0.15, 0.25, 0.4, 0.6, 1.0, 2.0)
 """By how much a gain that changes may do so."""
+OTHER_FAULTS: dict[str, Fault] = {"backlash": backlash, "stiction": stiction, "saturation": saturation}
+OTHER_CHANGES = {"above rest": above_rest, "squared": squared, "cubed": cubed}
+"""What else may explain a record, and is not named here."""
 CLEAR = 16.0
 """By how much a fault has to lower chi-squared in a score test to be fitted."""
 FITTED, REFINED = 3, 6
 """How many sizes of each kind are fitted, and how often the best is refined."""
 STRUCTURES: tuple[Structure, ...] = (SECOND, SECOND_WITH_ZERO, THIRD)
 STEPS = 8
-RIVAL = 10.0
-"""By how much BIC of the fault must be below that of any other kind."""
+RIVAL = {"rate": 15.0, "window": 30.0, "steps": 60.0}
+"""By how much BIC of each kind of fault must be below that of any other kind: the more ways there are to place it, the
+more of what else is in a record it can stand for."""
 EXPLAINED = 1.6, 0.006
 """Largest residual by which a fault explains the record: in standard deviations of the noise at rest, or as a part of
 PV's range. A sound actuator has to leave less (`evaluation`): what is said here is a reason, no model."""
@@ -62,7 +66,7 @@ class MvFault:
 class _Tried:
     """A fault of one size: what it makes of MV in the record.
 
-    kind: of the fault; those that begin with "other" are not named here. size: what `_near` refines. u: MV units,
+    kind: of the fault. size: what `_near` refines. u: MV units,
     shape (N,).
     """
 
@@ -88,12 +92,12 @@ def find_mv_fault(fit: Fit[ExperimentRecord], best: Fitted, mv_at_rest: float) -
             continue
         shares, deviations = tests.scores(np.array([each.u for each in tried]) - record.u)
         decrease = np.where(np.isfinite(deviations), (2.0 * shares - 1.0) / np.square(deviations), 0.0)
-        ranked = np.argsort(-decrease)
+        ranked = np.argsort(-decrease).tolist()
         if not decrease[ranked[0]] > CLEAR:
             continue
         some = [tried[i] for i in _distinct(ranked, tried)]
         likeliest[tried[0].kind] = _refined(record, mv_at_rest, plain, some)
-    named = {kind: each for kind, each in likeliest.items() if not kind.startswith("other")}
+    named = {kind: each for kind, each in likeliest.items() if kind in RIVAL}
     if not named:
         return None
     found, fault = min(named.values(), key=lambda each: each[0].bic)
@@ -101,7 +105,7 @@ def find_mv_fault(fit: Fit[ExperimentRecord], best: Fitted, mv_at_rest: float) -
     noise, least = EXPLAINED
     explained = found.rms <= max(noise * record.noise / record.output_range, least)
     gain = best.bic - found.bic
-    if not explained or gain < MIN_BIC_GAIN or found.bic > min(others, default=math.inf) - RIVAL:
+    if not explained or gain < MIN_BIC_GAIN or found.bic > min(others, default=math.inf) - RIVAL[fault.kind]:
         return None
     return MvFault(_in_words(fault, record), gain)
 
@@ -119,13 +123,10 @@ def _kinds(record: ExperimentRecord, mv_at_rest: float) -> Iterator[Iterator[_Tr
         for k in range(PHASES)
         for each in _window(record, mv_at_rest, length, length * k / PHASES)
     )
-    for fault in (backlash, stiction, saturation):
-        yield (
-            _Tried(f"other {fault.__name__}", (size,), record.input_range * fault(record.u / record.input_range, size))
-            for size in SIZES
-        )
-    for change in (above_rest, squared, cubed):
-        yield (_Tried(f"other {change.__name__}", (share,), record.u + share * change(record)) for share in SHARES)
+    for name in OTHER_FAULTS:
+        yield (_other(record, name, size) for size in SIZES)
+    for name in OTHER_CHANGES:
+        yield (_other(record, name, share) for share in SHARES)
 
 
 def _refined(
@@ -178,12 +179,23 @@ def _near(record: ExperimentRecord, mv_at_rest: float, fault: _Tried, finer: flo
         for turned in (-finer, finer):
             yield _steps(record, move / (move / step + 0.12 * turned), first)
             yield _steps(record, step, first + turned * step / STEP_PHASES / 2.0)
+    elif fault.kind in OTHER_FAULTS or fault.kind in OTHER_CHANGES:
+        (size,) = fault.size
+        yield from (_other(record, fault.kind, size * 1.25 ** (sign * finer * 0.5)) for sign in (-1.0, 1.0))
     elif fault.kind == "window":
         length, begin = fault.size
         turned = length / PHASES * finer
         off = length**2 / len(record.u) / 4.0 * finer
         for more, later in ((0.0, turned), (0.0, -turned), (off, 0.0), (-off, 0.0)):
             yield from _window(record, mv_at_rest, length + more, begin + later)
+
+
+def _other(record: ExperimentRecord, name: str, size: float) -> _Tried:
+    """A fault of the valve of this size, a part of MV's largest move, or a gain that changes so much."""
+    if name in OTHER_FAULTS:
+        scale = record.input_range
+        return _Tried(name, (size,), scale * OTHER_FAULTS[name](record.u / scale, size))
+    return _Tried(name, (size,), record.u + size * OTHER_CHANGES[name](record))
 
 
 def _rate(record: ExperimentRecord, rate: float) -> _Tried:

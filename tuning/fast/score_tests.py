@@ -30,6 +30,8 @@ NOTABLE_LATER = 0.3
 NEGLIGIBLE_DIRECTION = 1e-9
 MIN_CHANGE = 0.1
 """Smallest part by which the plant's gain must differ under the new gains to be shown."""
+ROUNDING_ALIKE = 0.5
+"""The part of the rounding errors that may go with the answer of an alternative all through a record."""
 FAR = 0.5
 """Where PV is far from the operating point, as a part of its way."""
 
@@ -112,6 +114,7 @@ class ScoreTests:
         self._basis = basis[:, singular > NEGLIGIBLE_DIRECTION * singular[0]]
         residual = found.linear.residual
         self._unexplained = self._without_known(residual)
+        self._rounding_of_variance = _undithered(fit, found)
         self._variance = found.linear.rss / max(fit.samples - found.parameters, 1) * durbin_watson_ratio(residual)
 
     def nonlinearity(self) -> Alternative | None:
@@ -121,14 +124,14 @@ class ScoreTests:
         scored = [(each, self.score(each.changed)) for each in ALTERNATIVES]
         scored += [(each, self.score_in_pv(each.changed)) for each in CHANGING_WITH_PV]
         for each, (size, deviation) in scored:
-            if abs(size) > max(each.minimum, STANDARD_DEVIATIONS * deviation):
+            if abs(size) > max(each.minimum, STANDARD_DEVIATIONS * deviation + self._by_rounding(deviation)):
                 shown.append(Alternative(each.words(size), size, deviation))
         return max(shown, key=lambda each: abs(each.size) / each.deviation, default=None)
 
     def changed_with_the_gains(self) -> Alternative | None:
         """A plant whose gain is another one under the new gains, None where the record does not show one."""
         size, deviation = self.score(since_step)
-        if abs(size) <= max(MIN_CHANGE, STANDARD_DEVIATIONS * deviation):
+        if abs(size) <= max(MIN_CHANGE, STANDARD_DEVIATIONS * deviation + self._by_rounding(deviation)):
             return None
         text = f"the plant's gain is {max(1.0 + size, 0.0):.2g} times what it was before the new gains took over"
         return Alternative(text, size, deviation)
@@ -189,6 +192,13 @@ class ScoreTests:
         at_rest = np.median(modelled[: max(self._fit.record.listened // self._fit.block, 1)])
         return self._regression(changed(np.asarray(modelled - at_rest)))
 
+    def _by_rounding(self, deviation: float) -> float:
+        """How large an alternative of this standard deviation rounding errors alone can make, where they go with PV."""
+        samples_worth = math.sqrt(len(self._unexplained) / self._variance) if self._variance > 0.0 else 0.0
+        return (
+            ROUNDING_ALIKE * self._rounding_of_variance * samples_worth * deviation if math.isfinite(deviation) else 0.0
+        )
+
     def _regression(self, column: Reals) -> tuple[float, float]:
         """The coefficient of a further column of the record in the residual, and its standard deviation."""
         sizes, deviations = self._regressions(column[:, None])
@@ -217,6 +227,18 @@ class ScoreTests:
     def _without_known(self, values: Reals) -> Reals:
         """What is left of columns of the record, shape (rows, ...), by everything that the fit can explain."""
         return np.asarray(values - self._basis @ (self._basis.T @ values))
+
+
+def _undithered(fit: Fit[ExperimentRecord], found: Fitted) -> float:
+    """The standard deviation of those rounding errors of PV that its noise does not make random, in ranges of PV.
+
+    They are a function of PV, of which noise leaves exp(-2 pi^2 (noise/step)^2). Source: B. Widrow, I. Kollar,
+    Quantization Noise, Cambridge 2008.
+    """
+    rounding = fit.record.rounding / fit.record.output_range
+    noise = math.sqrt(max(found.linear.rss / fit.samples * fit.block - rounding**2, 0.0))
+    step = rounding * math.sqrt(12.0)
+    return rounding * math.exp(-2.0 * (math.pi * noise / step) ** 2) if step > 0.0 else 0.0
 
 
 def _sides(size: float) -> str:

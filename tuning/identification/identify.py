@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopwright.tuning.analysis.notebook import as_html
+from loopwright.tuning.analysis.pv_faults import pv_faults, without_wrong_samples
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN, by_bic
 from loopwright.tuning.identification.feedback_test import follows_from_pv
 from loopwright.tuning.identification.output_error import NOT_AT_REST_INITIALLY, UNDISTURBED, Fitted, count
@@ -190,6 +191,8 @@ def identify(
     NOISE_TOO_HIGH where the noise is more than half of the answer. The plant must be stable or integrate once.
     """
     record = recorded_test(t, u, y, u_before)
+    wrong = pv_faults(record.y).of_wrong_samples
+    record = replace(record, y=without_wrong_samples(record.y))
     problem = IdentificationProblem(record)
     best, tried = _chosen(problem, lags_only)
     problem.require_visible_response(best)
@@ -197,6 +200,8 @@ def identify(
     ranked = {(fit.structure, fit.hypothesis): fit for fit in sorted([*tried, best], key=by_bic, reverse=True)}
     ranked[best.structure, best.hypothesis] = best
     found = _result(problem, best, sorted(ranked.values(), key=by_bic), float(np.asarray(t, dtype=float)[0]))
+    if wrong is not None:
+        found = replace(found, notes=(f"{wrong}: they were left out.", *found.notes))
     if not lags_only and follows_from_pv(record.u, record.y):
         found = replace(found, explained=False, notes=(FEEDBACK, *found.notes))
     return found
@@ -311,8 +316,11 @@ def _notes(
         coarse = 100.0 * problem.resolution
         notes.append(f"PV is recorded in steps of {coarse:.2g} % of its range, which limits the result.")
     if not found.explained:
+        renewal = pv_faults(problem.record.y).of_renewal(problem.record.Ts)
         notes.append(
-            f"The residual is not white noise ({100.0 * best.rms:.2g} % of PV's range): the plant has another "
+            f"{renewal}: the sensor, not the plant."
+            if renewal is not None
+            else f"The residual is not white noise ({100.0 * best.rms:.2g} % of PV's range): the plant has another "
             "structure, or something else moved PV."
         )
     top = ranked[0]

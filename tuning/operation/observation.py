@@ -23,6 +23,7 @@ from loopwright.tuning.fast.record import LONGEST_DEAD_TIME, MIN_LISTENED, Excit
 from loopwright.tuning.fast.record_evaluation import PERIOD_IS_RIGHT, first_period
 from loopwright.tuning.fast.robustness import KnownMs, known_Ms
 from loopwright.tuning.fast.score_tests import STANDARD_DEVIATIONS, ScoreTests, since
+from loopwright.tuning.fast.what_hides import OF_THE_RECORD, of_pv
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN
 from loopwright.tuning.operation.consistency import consistent
@@ -109,9 +110,24 @@ def observe(stretches: Sequence[Stretch], reverse: bool, spec: DesignSpec) -> Ob
     if not known:
         return Observation(Reason.UNCERTAIN, "no set-point change has been heard yet")
     try:
-        return _observed(known, stretches, reverse, spec)
+        return _named(_observed(known, stretches, reverse, spec), known)
     except Refused as refused:
         return Observation(refused.reason, refused.detail)
+
+
+def _named(found: Observation, stretches: Sequence[Stretch]) -> Observation:
+    """The observation, which names what hides in PV where its record is not explained."""
+    if found.evaluation is None or found.reason not in OF_THE_RECORD:
+        return found
+    named = next(filter(None, (of_pv(each.pv, each.Ts) for each in stretches if each.held_s is None)), None)
+    if named is None:
+        return found
+    known = found.reason in (Reason.UNCERTAIN, Reason.AMBIGUOUS)  # the model is right as far as it is known
+    return replace(
+        found,
+        reason=found.reason if known else Reason.PV_ALTERED,
+        detail=f"{named}; {found.detail}" if known else named,
+    )
 
 
 def _observed(known: list[Stretch], stretches: Sequence[Stretch], reverse: bool, spec: DesignSpec) -> Observation:

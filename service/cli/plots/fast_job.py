@@ -71,10 +71,7 @@ def before_after(figure: Figure | SubFigure, job: Shown, pv_unit: str) -> None:
     turned = sign(model)  # the responses are of a plant of positive gain
     # method setpoint steps home, which is mostly down
     size = 1.0 if job.verification is None else abs(job.verification.step or 1.0)
-    gains = {
-        label: shown.gains()
-        for label, shown in (("before", job.old_gains), ("after", job.new_gains))
-    }
+    gains = {label: shown.gains() for label, shown in (("before", job.old_gains), ("after", job.new_gains))}
     assessed = {label: assess(model, each) for label, each in gains.items()}
     figure.suptitle(f"{job.loop}: {_changes(gains, assessed)}", fontsize=10.5)
     axes = figure.subplots(2, 2, sharex="col", height_ratios=(3, 1.4))

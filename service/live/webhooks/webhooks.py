@@ -58,9 +58,7 @@ class Webhooks:
 
     def start(self) -> None:
         """Begins to deliver, also what an earlier process has left."""
-        left = webhook_deliveries.give_up_others(
-            self._store, [each.name for each in self.configs], self._clock.now_s()
-        )
+        left = webhook_deliveries.give_up_others(self._store, [each.name for each in self.configs], self._clock.now_s())
         if left:
             log.warning("%d messages of webhooks that are not configured any more are given up", left)
         for sender in self._senders:
