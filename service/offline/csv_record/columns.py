@@ -123,7 +123,7 @@ def find_columns(header: Sequence[str], chosen: Mapping[str, str], line: int, ti
                 problems.append(f"line {line}: {_missing(header, accepted, quantity, timed)}")
         except Unusable as error:
             problems.append(f"line {line}: {error}")
-    problems += [f"line {line}: {problem}" for problem in _ambiguous(header, names, chosen, several)]
+    problems += [f"line {line}: {problem}" for problem in _ambiguous(header, names, at, several)]
     at |= {quantity: found[0] for quantity, found in several.items() if len(found) == 1}
     twice = {place for place in at.values() if list(at.values()).count(place) > 1}
     problems += [f"column {header[place]!r} is chosen for more than one quantity" for place in sorted(twice)]
@@ -157,23 +157,26 @@ def _tag(name: str) -> list[str]:
 
 
 def _ambiguous(
-    header: Sequence[str], names: Sequence[str], chosen: Mapping[str, str], several: dict[str, list[int]]
+    header: Sequence[str], names: Sequence[str], at: Mapping[str, int], several: dict[str, list[int]]
 ) -> list[str]:
-    """What is wrong with columns that names alone do not tell apart; of several loops, the columns of the one that the
-    user chose are left in `several`."""
+    """What is wrong with columns that names alone do not tell apart.
+
+    at: the columns that the user chose. several: those that may be each of the other quantities; of several loops,
+    those of the loop that the user chose are left.
+    """
     problems = []
     if _both_ways(names, several):
         # PV of a controller is its input, that of a plant its output
         inputs, outputs = _ending_in(names, INPUTS), _ending_in(names, OUTPUTS)
         del several["u"]
         one, other = (header[each[0]].strip() for each in (inputs, outputs))
-        pv = ("", "") if "y" in several or "y" in chosen else (f' --y "{other}"', f' --y "{one}"')
+        pv = ("", "") if "y" in several or "y" in at else (f' --y "{other}"', f' --y "{one}"')
         problems.append(
             f"{one} and {other} may be those of the plant or of the controller. Say which is MV: "
             f'--u "{one}"{pv[0]} where it is the input of the plant, '
             f'--u "{other}"{pv[1]} where it is the output of the controller'
         )
-    here = [_chosen(header, names, chosen[quantity], quantity) for quantity in ("y", "u", "sp") if quantity in chosen]
+    here = [at[quantity] for quantity in ("y", "u", "sp") if quantity in at]
     times = list(several.get("t", ()))
     for quantity, found in several.items():
         if len(found) > 1 and here:

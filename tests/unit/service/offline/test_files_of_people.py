@@ -298,7 +298,7 @@ def test_other_sensors_are_held_where_that_is_asked_for() -> None:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("Time;Event;User\n" + lines(lambda t: f"2026-11-25 10:00:00;PV high {t:g};ann"), "line 1 is 'Time;Event;User'"),
+        ("Time;Event;User\n" + lines(lambda t: f"2026-11-25 10:00;PV high {t:g};ann"), "line 1 is 'Time;Event;User'"),
         ("t,tag,event,level\n" + lines(lambda t: f"2026-11-25T10:00:00,TIC,HI,{t:g}"), "line 2 has no two numbers"),
         (lines(lambda t: f"2026-11-25 10:00 INFO loop[{t:g}] pv={pv(t)}"), "line 1 is '2026-11-25 10:00 INFO"),
         ("Starting\n" + lines(lambda t: "[1] INFO: reading sensor, value ok"), "line 1 is 'Starting'"),
