@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from loopwright.service.inputs.validation import did_you_mean
 from loopwright.service.offline.csv_record.errors import Unusable
+from loopwright.service.offline.csv_record.numbers import is_moment, is_number
 from loopwright.service.offline.csv_record.time_units import SECONDS, unit_at_end
 from loopwright.service.offline.csv_record.words import plain
 
@@ -61,6 +62,7 @@ _TIME_UNITS = re.compile(
     rf"^(?P<name>{'|'.join(map(re.escape, NAMES['t']))})(?:_|\s*[ ,/]\s*)(?P<unit>{'|'.join(SECONDS)})\.?$"
 )
 _TAG = re.compile(r"[.:/_\s\\-]+")
+_NUMBERED = re.compile(r"^(?P<name>[a-z]{2,})[_ ]?(?P<number>\d+)$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,10 +120,10 @@ def find_columns(header: Sequence[str], chosen: Mapping[str, str], line: int, ti
             elif quantity == "y" and _both_ways(names, several):
                 continue  # asked for together with MV
             elif quantity not in _OPTIONAL:
-                problems.append(f"line {line}: {_missing(header, accepted, quantity)}")
+                problems.append(f"line {line}: {_missing(header, accepted, quantity, timed)}")
         except Unusable as error:
             problems.append(f"line {line}: {error}")
-    problems += [f"line {line}: {problem}" for problem in _ambiguous(header, names, chosen, several)]
+    problems += [f"line {line}: {problem}" for problem in _ambiguous(header, names, at, several)]
     at |= {quantity: found[0] for quantity, found in several.items() if len(found) == 1}
     twice = {place for place in at.values() if list(at.values()).count(place) > 1}
     problems += [f"column {header[place]!r} is chosen for more than one quantity" for place in sorted(twice)]
@@ -140,29 +142,41 @@ def _only(names: Sequence[str], accepted: Sequence[str]) -> int | None:
 
 
 def _named(names: Sequence[str], accepted: Sequence[str]) -> list[int]:
-    """The columns with one of the names, else those whose names end in one after a tag."""
+    """The columns with one of the names, else those whose names end in one after a tag, else those with a number behind
+    it."""
     exactly = [i for i, name in enumerate(names) if name in accepted]
-    return exactly or [i for i, name in enumerate(names) if _TAG.split(name)[-1] in accepted]
+    tagged = exactly or [i for i, name in enumerate(names) if _TAG.split(name)[-1] in accepted]
+    return tagged or [i for i, name in enumerate(names) if (n := _NUMBERED.match(name)) and n["name"] in accepted]
+
+
+def _tag(name: str) -> list[str]:
+    """What tells a column from that of another loop with the same name."""
+    if numbered := _NUMBERED.match(name):
+        return [numbered["number"]]
+    return _TAG.split(name)[:-1]
 
 
 def _ambiguous(
-    header: Sequence[str], names: Sequence[str], chosen: Mapping[str, str], several: dict[str, list[int]]
+    header: Sequence[str], names: Sequence[str], at: Mapping[str, int], several: dict[str, list[int]]
 ) -> list[str]:
-    """What is wrong with columns that names alone do not tell apart; of several loops, the columns of the one that the
-    user chose are left in `several`."""
+    """What is wrong with columns that names alone do not tell apart.
+
+    at: the columns that the user chose. several: those that may be each of the other quantities; of several loops,
+    those of the loop that the user chose are left.
+    """
     problems = []
     if _both_ways(names, several):
         # PV of a controller is its input, that of a plant its output
         inputs, outputs = _ending_in(names, INPUTS), _ending_in(names, OUTPUTS)
         del several["u"]
         one, other = (header[each[0]].strip() for each in (inputs, outputs))
-        pv = ("", "") if "y" in several or "y" in chosen else (f' --y "{other}"', f' --y "{one}"')
+        pv = ("", "") if "y" in several or "y" in at else (f' --y "{other}"', f' --y "{one}"')
         problems.append(
             f"{one} and {other} may be those of the plant or of the controller. Say which is MV: "
             f'--u "{one}"{pv[0]} where it is the input of the plant, '
             f'--u "{other}"{pv[1]} where it is the output of the controller'
         )
-    here = [_chosen(header, names, chosen[quantity], quantity) for quantity in ("y", "u", "sp") if quantity in chosen]
+    here = [at[quantity] for quantity in ("y", "u", "sp") if quantity in at]
     times = list(several.get("t", ()))
     for quantity, found in several.items():
         if len(found) > 1 and here:
@@ -193,8 +207,8 @@ def _both_ways(names: Sequence[str], several: Mapping[str, list[int]]) -> bool:
 
 def _beside(names: Sequence[str], found: Sequence[int], place: int, times: Sequence[int]) -> list[int]:
     """The columns that belong to the loop of the column at `place`: of the same tag, else after the same time."""
-    tag = _TAG.split(names[place])[:-1]
-    same = [i for i in found if tag and _TAG.split(names[i])[:-1] == tag]
+    tag = _tag(names[place])
+    same = [i for i in found if tag and _tag(names[i]) == tag]
     if same or len(times) < 2:
         return same
     block = sum(each <= place for each in times)
@@ -229,16 +243,16 @@ def _chosen(header: Sequence[str], names: Sequence[str], wanted: str, quantity: 
     raise Unusable(f"--{quantity}: no column {given!r}{did_you_mean(given, _there(header))}; {_list(header)}")
 
 
-def _missing(header: Sequence[str], accepted: Sequence[str], quantity: str) -> str:
+def _missing(header: Sequence[str], accepted: Sequence[str], quantity: str, timed: bool) -> str:
     if {"value", "tagname"} <= {name.strip().lower() for name in header} or {"value", "tag"} <= {
         name.strip().lower() for name in header
     }:
         return f"{ONE_VALUE}; export the tags side by side: a line for each time, a column for each"
     if len(header) == 1:
         return "one column alone; columns are separated by comma, semicolon or tab"
-    numbered = all(_is_number(cell) for cell in header)
+    numbered = all(is_number(cell) or is_moment(cell) or not cell.strip() for cell in header)
     if numbered:
-        number = f"--{quantity} {_USUAL[quantity]}"
+        number = f"--{quantity} {_USUAL[quantity] - (not timed)}"
         every = ", or --every 1s where the file has none and its lines come every second" if quantity == "t" else ""
         return f"no column for {SHOWN[quantity]}: the line has no names. Give its number, as {number}{every}"
     known = ", ".join(accepted[:4])
@@ -252,11 +266,3 @@ def _there(header: Sequence[str]) -> list[str]:
 
 def _list(header: Sequence[str]) -> str:
     return f"there are: {', '.join(cell.strip() or '(no name)' for cell in header)}"
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell.replace(",", "."))
-    except ValueError:
-        return not cell.strip()
-    return True

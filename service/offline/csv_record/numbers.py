@@ -20,6 +20,9 @@ BAD_STATES = frozenset(
 MISSING = BAD_STATES | {"", "-", "--", "?", "na", "n/a", "#n/a", "nan", "null", "none", "missing"}
 """What stands in small letters where a historian had no good value."""
 
+MAX_MOMENT = 40
+_MOMENT = re.compile(r"\d[./:-]\w+[./:-]\d|\d:\d\d")
+"""What shows a cell to be a date or a time of day, and the characters of the longest one."""
 MINUS = "\u2212"
 """The minus sign of typesetters, which spreadsheets write as well."""
 _THOUSANDS = {".": ",", ",": "."}
@@ -36,6 +39,11 @@ _GROUPS = {
 
 def is_missing(cell: str) -> bool:
     return cell.strip().lower() in MISSING
+
+
+def is_moment(cell: str) -> bool:
+    """Whether a cell looks like a date or a time of day."""
+    return len(cell) < MAX_MOMENT and _MOMENT.search(cell) is not None
 
 
 def number(cell: str, decimal: str) -> float | None:

@@ -21,7 +21,7 @@ from loopwright.service.offline.csv_record.qualities import bad_values
 from loopwright.service.offline.csv_record.sampling import sampled
 from loopwright.service.offline.csv_record.table import Table, read_table
 from loopwright.service.offline.csv_record.text import decoded
-from loopwright.service.offline.csv_record.time_units import seconds_in
+from loopwright.service.offline.csv_record.time_units import WEEK, seconds_in
 from loopwright.service.offline.csv_record.times import are_numbers, seconds
 from loopwright.service.offline.csv_record.words import TWO_STATES, plain, switched
 from loopwright.tuning.models import Reals
@@ -130,6 +130,11 @@ def _record(table: Table, options: ReadOptions) -> Record:
         problems = [*error.problems, *problems]
     if problems:
         raise Unusable(*problems)
+    if "t" in numeric and units.get("t") and float(np.ptp(t)) > WEEK:
+        notes.append(
+            f"The record is {float(np.ptp(t)) / 86400.0:.3g} d long by {called['t']} in {unit}: check the unit; "
+            "--time-unit reads another one."
+        )
     found = sampled(t, values, table.lines, options.resample_s, options.hold)
     notes += found.notes
     if table.skipped:

@@ -130,11 +130,12 @@ def _why_not(t: Reals, steps: Reals, doubtful: NDArray[np.intp]) -> str:
         return f": the clock went back by an hour there, as at the end of summer time; {_IN_UTC}"
     if any(steps[i] != 0.0 for i in doubtful):
         return ""
+    why = ": samples of the same time and other values; export fractions of a second, too, or "
+    if len(doubtful) < 0.1 * len(t):
+        return why + "delete one of them"
     together = len(t) / (len(t) - len(doubtful))
     every = float(t[-1] - t[0]) / max(len(t) - round(together), 1)
-    return ": samples of the same time and other values; export fractions of a second, too" + (
-        f", or, if the lines come evenly, --every {_round(every):g}s in place of the times" if every > 0.0 else ""
-    )
+    return why + f"give the time between the lines if they come evenly: --every {_round(every):g}s"
 
 
 def _is_hour(step: float, change: float, usual: float) -> bool:
@@ -291,7 +292,9 @@ def _resolution_of_changes(t: Reals, column: Reals) -> float | None:
     there = ~np.isnan(column)
     moves, intervals = np.abs(np.diff(column[there])), np.diff(t[there])
     changes = moves[moves > 0.0]
-    if len(changes) < MIN_CHANGES or len(moves) - len(changes) > MAX_REPEATED * len(moves):
+    # a value that did not change for long may be repeated, to show that the sensor lives
+    repeated = (moves == 0.0) & (intervals <= np.median(intervals))
+    if len(changes) < MIN_CHANGES or np.count_nonzero(repeated) > MAX_REPEATED * len(moves):
         return None
     step = float(np.min(changes))
     steps = changes / step

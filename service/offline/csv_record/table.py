@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import csv
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from loopwright.service.offline.csv_record.columns import NAMES, ONE_VALUE, Columns, find_columns
 from loopwright.service.offline.csv_record.errors import Unusable, counted
-from loopwright.service.offline.csv_record.numbers import is_missing, is_number
+from loopwright.service.offline.csv_record.numbers import is_missing, is_moment, is_number
 from loopwright.service.offline.csv_record.time_units import seconds_in
 from loopwright.service.offline.csv_record.words import is_on_or_off, plain
 
-DELIMITERS = ("\t", ";", ",", " ")
+DELIMITERS = ("\t", ";", "|", ",", " ")
 """Signs that separate cells; the first one that suits most lines is taken, so that a comma between blanks separates."""
 LOOKED_AT = 400
 """Lines among which the samples are looked for: reports have titles, tags and settings above them."""
@@ -26,12 +25,18 @@ MAX_UNIT = 12
 """Characters of the longest text that is taken for a unit."""
 MAX_SHOWN = 50
 _COMMENTS = ("#", "%", "//")
-_MOMENT = re.compile(r"\d[./:-]\w+[./:-]\d|\d:\d\d")
-"""What shows a cell to be a date or a time of day."""
 _LABELS = frozenset(
-    {"unit", "units", "einheit", "einheiten", "unite", "unites", "unidad", "unidades", "eu", "uom", "eng units"}
-)
-"""What stands before the units of the other columns, as `plain` makes it, and is no unit of the time."""
+    {
+        "unit", "units", "einheit", "einheiten", "unite", "unites", "unidad", "unidades", "eu", "uom", "eng units",
+        "double", "float", "real", "int", "integer", "number", "datetime", "string",
+    }
+)  # fmt: skip
+"""What stands below the name of the time, before the units or the types of the other columns, as `plain` makes it, and
+is no unit."""
+_OTHER_TEXTS = (
+    ("<?xml", "XML"), ("<", "a page in HTML or XML"), ("{\\rtf", "RTF"), ("{", "JSON"), ("[{", "JSON"),
+)  # fmt: skip
+"""How texts begin that are in another format."""
 NO_TABLE = (
     "is not a table of measurements: {why}. A line for each time is needed, with the time, MV and PV side by side; "
     "export the trend of the loop as CSV"
@@ -135,7 +140,7 @@ def _header(
     if all(chosen.get(quantity, "").strip().isdigit() for quantity in (("t", "u", "y") if timed else ("u", "y"))):
         full = [at for at in wide if all(cell.strip() for cell in _cells(lines[at][1], delimiter))]
         above = [*full, *above]
-    tried: list[tuple[int, Sequence[str]]] = []
+    tried: list[tuple[int, tuple[str, ...]]] = []
     for at in [*above, first]:
         place, line = lines[at]
         for sign in (delimiter, *(each for each in DELIMITERS if each != delimiter and each in line)):
@@ -157,23 +162,24 @@ def _header(
                 continue
             if len(columns.names) == width:
                 return columns, delimiter, first - 1 if first else -1, start
-    return _raise_best(lines, tried, wide or [first], delimiter, first)
+    raise _no_names(lines, tried, wide or [first], delimiter, first)
 
 
-def _raise_best(
+def _no_names(
     lines: Sequence[tuple[int, str]],
-    tried: Sequence[tuple[int, Sequence[str]]],
+    tried: Sequence[tuple[int, tuple[str, ...]]],
     likely: Sequence[int],
     delimiter: str,
     first: int,
-) -> tuple[Columns, str, int, int]:
-    """Raises Unusable with what is wrong with the likeliest line of names."""
+) -> Unusable:
+    """What is wrong with the likeliest line of names. tried: the errors of each line that was read as one."""
     one_value = any(ONE_VALUE in problem for _, problems in tried for problem in problems)
     figures = sorted(_figures(_cells(line, delimiter)) for _, line in lines[first : first + MANY_SAMPLES])
     if figures[len(figures) // 2] < 2 and not one_value:
-        raise Unusable(NO_TABLE.format(why=f"line {lines[first][0]} has no two numbers side by side"))
+        return Unusable(NO_TABLE.format(why=f"line {lines[first][0]} has no two numbers side by side"))
     of_likely = [problems for at, problems in tried if at in likely] or [problems for _, problems in tried]
-    raise Unusable(*min(of_likely, key=len))
+    fewest = min(of_likely, key=len)
+    return Unusable(*dict.fromkeys(fewest))
 
 
 def _named_without_samples(
@@ -226,18 +232,14 @@ def _first_in_a_row(places: Sequence[int], end: int) -> int:
 
 
 def _part_of_values(cells: Sequence[str]) -> float:
-    """The part of the cells of a line that are values; 0 for a line without two values, or with more words than that."""
+    """The part of the cells of a line that are values; 0 for a line without two of them, or with more words."""
     there = [cell for cell in cells if cell.strip()]
-    values = sum(is_number(cell) or is_missing(cell) or is_on_or_off(cell) or _is_moment(cell) for cell in there)
+    values = sum(is_number(cell) or is_missing(cell) or is_on_or_off(cell) or is_moment(cell) for cell in there)
     return values / len(there) if _figures(cells) >= 1 and values >= 2 and 2 * values >= len(there) else 0.0
 
 
 def _figures(cells: Sequence[str]) -> int:
     return sum(is_number(cell) or is_on_or_off(cell) for cell in cells)
-
-
-def _is_moment(cell: str) -> bool:
-    return len(cell) < 40 and _MOMENT.search(cell) is not None
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
@@ -288,7 +290,8 @@ def _units(rows: Sequence[Sequence[str]], columns: Columns) -> dict[str, str]:
 def _time_unit(cells: Sequence[str]) -> str:
     """The first known unit of time in cells of which some describe the column, else the first that may claim to be one,
     whatever its length: an unknown unit must not be taken for s."""
-    said = [cell for cell in cells if cell and plain(cell) not in NAMES["t"] and plain(cell.rstrip(":")) not in _LABELS]
+    no_units = {*NAMES["t"], *_LABELS}
+    said = [cell for cell in cells if any(map(str.isalpha, cell)) and plain(cell.rstrip(":")) not in no_units]
     return next((cell for cell in said if seconds_in(cell) is not None), said[0] if said else "")
 
 

@@ -31,11 +31,12 @@ KNOWN = "ns, us, ms, s, min, h and d"
 """The units, for sentences."""
 _NO_UNIT = re.compile(r"^(?:|utc|gmt|z|local|local time|(?:utc|gmt)?\s?[+-]\d{1,2}(?::?\d{2})?)$")
 """What stands in brackets behind the name of a time, and says nothing of its unit."""
-USUAL_MINUTES = (2, 3, 5, 10, 15, 20, 30, 60, 120, 180, 240, 360, 480, 720, 1440)
-"""Times between samples that are usual where they are longer than a minute, min."""
-_SELDOM, _DAY = 100.0, 86400.0
-"""Time between samples from which on they are seldom logged in anything but whole minutes, and a day, s."""
-_WEEK = 7.0 * _DAY
+USUAL_MINUTES = (1, 1.5, 2, 3, 5, 10, 15, 20, 30, 60, 120, 180, 240, 360, 480, 720, 1440)
+"""Times between samples that are usual where they are a minute or longer, min."""
+_SELDOM, _DAY = 50.0, 86400.0
+"""Time between samples from which on they seldom come in anything but whole minutes, and a day, s."""
+WEEK = 7.0 * _DAY
+"""Length of a record from which on its unit of time is questioned, s."""
 _LATEST = 1e11
 """Seconds of three thousand years, beyond which a time has another unit than its column says."""
 
@@ -68,7 +69,7 @@ def require_s_likely(times: Reals, name: str) -> None:
     steps = np.abs(np.diff(times))
     usual, length = (float(np.median(steps)), float(np.ptp(times))) if len(steps) else (0.0, 0.0)
     whole_minutes = any(abs(usual - 60.0 * minutes) < 0.01 * usual for minutes in USUAL_MINUTES)
-    if length > _WEEK or (usual >= _SELDOM and not whole_minutes):
+    if length > WEEK or (usual >= _SELDOM and not whole_minutes):
         shown = f"{length / _DAY:.3g} d" if length > _DAY else f"{length / 3600.0:.3g} h"
         raise Unusable(
             f"{name} has no unit; as s its values come every {usual:.4g} s, {shown} in all. Say which unit it is: "
@@ -78,7 +79,7 @@ def require_s_likely(times: Reals, name: str) -> None:
 
 def _put(name: str) -> str:
     bare = re.split(r"\s*[(\[{]", name)[0] or name
-    return f"put one of {KNOWN} in its place, as in '{bare} (min)'"
+    return f"put one of {KNOWN} in its place, as in '{bare} (min)', or give it by --time-unit"
 
 
 def _word(text: str) -> str:

@@ -29,6 +29,8 @@ from loopwright.tuning.models import Reals
 
 _EPOCHS = ((1e18, 1e-9), (1e17, 1e-7), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))
 """Times from so large a number on count from an epoch, in units of so many s: ns, Windows' 100 ns, us, ms, s."""
+_SURELY_SINCE_1970 = 6e8
+"""Seconds since 1970 of early 1989; before that a number may as well count ms from anywhere."""
 _MONTHS = {
     **{name.lower(): i for i, name in enumerate(month_abbr) if name},
     **{"mrz": 3, "mai": 5, "okt": 10, "dez": 12},
@@ -134,6 +136,8 @@ def _of_numbers(cells: Sequence[str], lines: Sequence[int], unit: str, name: str
         return np.asarray(times * size_s)
     for smallest, size in _EPOCHS:
         if times[0] >= smallest:
+            if size == 1.0 and times[0] < _SURELY_SINCE_1970:
+                require_s_likely(times, name)
             return _from_first(times) * size
     if are_days(times, cells, name):
         return _from_first(times) * _DAY

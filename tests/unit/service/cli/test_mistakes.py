@@ -66,6 +66,26 @@ MISTAKES = [
     Mistake("PV has a name of the plant's own.", "identify data.csv", csv("t,u,TI-4711\n" + STEP)),
     Mistake("The name after `--y` is misspelled.", "identify data.csv --y Tempratur", csv("t,u,Temperatur\n" + STEP)),
     Mistake("The file has no line of names.", "identify data.csv", csv(STEP)),
+    Mistake(
+        "The times are in ms, and nothing says so.", "identify data.csv",
+        csv("t,u,y\n" + "".join(f"{100 * int(line.split(',')[0])}{line[line.index(','):]}\n" for line in STEP.split())),
+    ),
+    Mistake(
+        "The file has no times.", "identify data.csv",
+        csv("u,y\n" + "".join(f"{line.split(',', 1)[1]}\n" for line in STEP.split())),
+    ),
+    Mistake(
+        "The columns have the words of a plant, or of a controller.", "identify data.csv",
+        csv("t,Input,Output\n" + STEP),
+    ),
+    Mistake(
+        "There are two loops in the file.", "identify data.csv",
+        csv("t,TIC1.OP,TIC1.PV,TIC2.OP,TIC2.PV\n" + "".join(f"{line},35,{k}\n" for k, line in enumerate(STEP.split()))),
+    ),
+    Mistake(
+        "The file is a list of events.", "identify data.csv",
+        csv("Time,Event,Operator\n" + "".join(f"2026-11-25 10:00:{k:02},PV high,Ann\n" for k in range(20))),
+    ),
     Mistake("MV and PV are swapped.", "identify data.csv", csv("t,y,u\n" + STEP)),
     Mistake(
         "The historian wrote a line for each value.", "identify data.csv",
