@@ -17,10 +17,10 @@ from benchmarks.plants import Plant, plants
 from loopwright.tuning.fast.design import Aim, DesignSpec, GainDesign
 
 PLAIN = (1.0, 1.0)
-NARROW, WIDE = (0.0, 1.0), (0.0, 10.0)
+UP_TO_2, WIDE = (0.0, 2.0), (0.0, 10.0)
 VARIANTS = {
     **{str(aim): DesignSpec(aim=aim) for aim in Aim},
-    "balanced, b up to 1": DesignSpec(weights=NARROW),
+    "balanced, b up to 2": DesignSpec(weights=UP_TO_2),
     "balanced, b up to 10": DesignSpec(weights=WIDE),
 }
 HEAD = (

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, computed_field
 
 from loopwright.service.jsonable import JsonObject
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
+from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction, time_constants
 
 DESIGNED = ("fast", "setpoint")
 """The methods that fit a model to one record and design the gains on it."""
@@ -18,6 +18,8 @@ FIVE_STAGE = "five-stage"
 TYPED_IN = "typed in"
 TOLD_APART = 2.0
 """Standard errors by which a pole has to lie away from zero, lest the plant be called integrating."""
+NEVER_SEEN = 1000.0
+"""Lag of a plant in dead times and other lags, above which no test is long enough to see it."""
 """The structure, or the source of the gain, of a model that a person has typed in."""
 
 
@@ -154,12 +156,15 @@ class TransferModelView(Figures):
 
     @computed_field(  # type: ignore[prop-decorator]
         description="Whether the plant integrates as far as the record shows: the pole nearest to zero is there, or "
-        "cannot be told from it"
+        "cannot be told from it, or its lag is a thousand times as long as all else"
     )
     @property
     def integrating(self) -> bool:
         last, error = self.den[-1], self.den_errors[-1] if self.den_errors else 0.0
-        return len(self.den) > 1 and abs(last) <= TOLD_APART * error
+        if len(self.den) < 2 or abs(last) <= TOLD_APART * error:
+            return len(self.den) > 1
+        *rest, slowest = sorted(map(float, time_constants(self.process_model())))
+        return slowest > NEVER_SEEN * (self.dead_time_s + sum(rest)) > 0.0
 
     @property
     def named(self) -> str:

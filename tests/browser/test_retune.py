@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+
+import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
@@ -11,6 +14,14 @@ from tests.browser.person import NAME
 from tests.browser.site import TAG, Site
 
 STAGES = ["At rest?", "Relay", "Model and gains", "Step", "Whole record"]
+
+
+def assert_drawn(page: Page, values: list[float]) -> None:
+    """The new curve of the set-point step goes through these values, on a linear axis."""
+    path = page.get_by_role("img", name="Set-point step before and after").locator("path.s-new").get_attribute("d")
+    places = np.array([float(y) for y in re.findall(r"[ML][\d.]+ ([\d.]+)", path or "")])
+    slope, at_zero = np.polyfit(values, places, 1)
+    assert slope < 0.0 and places == pytest.approx(at_zero + slope * np.array(values), abs=0.11)
 
 
 def test_retuned_compared_accepted_and_rolled_back(site: Site, page: Page) -> None:
@@ -23,6 +34,12 @@ def test_retuned_compared_accepted_and_rolled_back(site: Site, page: Page) -> No
     start = page.get_by_role("button", name=f"Retune {TAG}")
     expect(form).to_contain_text("Who signs?")
     expect(start).to_be_disabled()
+    page.get_by_role("button", name="More options").click()
+    form.get_by_label("SP step").fill("x")
+    expect(form).to_contain_text("Not a number: “SP step”.")
+    form.get_by_label("SP step").fill("5")
+    expect(form).to_contain_text("“SP step” 5 is more than the configured 0.1")
+    form.get_by_label("SP step").fill("")
     person.sign(page)
     person.remember(page, ".dock .stage")
     start.click()
@@ -38,6 +55,9 @@ def test_retuned_compared_accepted_and_rolled_back(site: Site, page: Page) -> No
     assert Ti == pytest.approx((old.ti, job["new_gains"]["Ti"]), rel=5e-4)
     assert person.figure(page, "Largest sensitivity Ms")[1] == pytest.approx(1.6, abs=0.01)
 
+    designs = site.ask(f"{job['url']}/designs")
+    assert_drawn(page, designs["after_curves"]["setpoint"]["pv"])
+
     # a slower loop by the slider: other gains in the table, and no way to accept what was not on the loop
     slider = page.get_by_role("slider", name="Ms", exact=True)
     expect(slider).to_be_enabled()
@@ -46,6 +66,9 @@ def test_retuned_compared_accepted_and_rolled_back(site: Site, page: Page) -> No
     expect(page.get_by_role("button", name="Accept the new gains")).not_to_be_attached()
     assert person.figure(page, "Gain Kp")[1] < Kp[1]
     assert person.figure(page, "Largest sensitivity Ms")[1] == pytest.approx(1.55, abs=0.01)
+    slower = next(each for each in designs["designs"] if each["Ms_asked"] == 1.55)
+    expect(page.locator(".choice")).to_contain_text(slower["beside"])
+    assert_drawn(page, slower["curves"]["setpoint"]["pv"])
     slider.press("Escape")
     expect(page.get_by_role("button", name="Accept the new gains")).to_be_enabled()
 
@@ -60,6 +83,8 @@ def test_retuned_compared_accepted_and_rolled_back(site: Site, page: Page) -> No
     page.keyboard.press("Enter")
     page.get_by_role("button", name=f"Write to {TAG}").click()
     expect(person.headline(page)).to_have_text("Accepted")
+    expect(page.locator(".choice")).to_contain_text(designs["after_beside"])
+    expect(page.locator(".choice")).not_to_contain_text("present gains")
     expect(person.decision(page)).to_contain_text(f"Accepted by {NAME}; in effect now: Kp {Kp[1]:.2f}")
     gains = site.ask(f"/loops/{TAG}")["live"]["gains"]
     assert (gains["Kp"], gains["Ti"]) == pytest.approx((job["new_gains"]["Kp"], job["new_gains"]["Ti"]))

@@ -15,8 +15,8 @@ from loopwright.tuning.models import Reals
 LEFT, RIGHT, TOP, BOTTOM = 52.0, 8.0, 8.0, 20.0
 _TICK_APART = 70.0
 _FARTHEST = 1e5
-_NAME_WIDTH = 130.0
-"""Width that the name of a line may take, px."""
+_NAME_WIDTH, _PER_LETTER = 130.0, 5.5
+"""Width that the name of a line may take, px: at least, and for each letter."""
 Place = TypeVar("Place", float, Reals)
 
 
@@ -112,7 +112,7 @@ class Picture:
         px = self.at_x(x)
         self.paths.append(Path(f"M{px:.1f} {TOP:.1f}V{TOP + self.inner_height:.1f}", look))
         if text:
-            at_the_end = px > LEFT + self.inner_width - _NAME_WIDTH
+            at_the_end = px > LEFT + self.inner_width - max(_NAME_WIDTH, _PER_LETTER * len(text))
             place = px - 3.0 if at_the_end else px + 3.0
             self.labels.append(Label(place, TOP + 10.0 + 11.0 * row, text, "end" if at_the_end else "note"))
 

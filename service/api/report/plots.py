@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopwright.service.api.report.drawing import Label, Picture, around
-from loopwright.service.api.report.words import stage_name
+from loopwright.service.api.report.words import mark_names
 from loopwright.service.curves import LOAD_PCT, LoopCurves
 from loopwright.service.jobs.job_record import JobRecord
 from loopwright.service.listening.bins import GAP_BEFORE, Bins
@@ -17,7 +17,7 @@ from loopwright.tuning.models import Reals
 WIDTH = 690.0
 _SMALL = (225.0, 160.0)
 _POINTS = 450
-_LABEL_APART = 120.0
+_LABEL_APART = 190.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +66,10 @@ def record_pictures(record: JobRecord, pv_step: float) -> list[Picture]:
     bottom = Picture("mv", "MV", x, around([mv], 5.0), WIDTH, 92.0)
     bottom.curve(t, mv, "mv", stepped=True)
     pictures.append(bottom)
-    for mark, row in zip(record.facts.marks, rows, strict=True):
+    names = mark_names([mark.stage for mark in record.facts.marks])
+    for mark, name, row in zip(record.facts.marks, names, rows, strict=True):
         for picture in pictures:
-            picture.line_at(mark.at_s, "mark", stage_name(mark.stage) if picture is top else "", row)
+            picture.line_at(mark.at_s, "mark", name if picture is top else "", row)
     for load in record.facts.loads:
         for picture in pictures:
             picture.line_at(load.t_s, "load", f"load {load.size:+.3g} %" if picture is top else "", max(rows) + 1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from loopwright.service.api.job_views import JobView
 from loopwright.service.api.report.numbers import Ms_error, duration, fixed, significant, with_unit
@@ -52,6 +52,21 @@ _ENDS = {
     JobState.INTERRUPTED: "Interrupted",
 }
 _WITH_REASON = (JobState.REFUSED, JobState.ABORTED, JobState.FAILED, JobState.INTERRUPTED)
+
+
+def mark_names(stages: Sequence[str]) -> list[str]:
+    """Returns the names of the marks in a picture of a record. A step that follows a relay or pulses does not begin at
+    rest, and its overshoot in the picture is not that of the gains."""
+    names = []
+    before = None
+    for stage in stages:
+        name = stage_name(stage)
+        if stage == "verify" and before is not None:
+            name = f"Step, from where {before} left PV"
+        if stage != "design":
+            before = {"relay": "the relay", "pulses": "the pulses"}.get(stage)
+        names.append(name)
+    return names
 
 
 def stage_name(stage: str | None) -> str:

@@ -21,6 +21,7 @@ from loopwright.service.api.report import numbers
 from loopwright.service.api.report.drawing import around, ticks
 from loopwright.service.api.report.fingerprint import FIELDS
 from loopwright.service.api.report.paper import ReportSource, paper
+from loopwright.service.api.report.words import mark_names, stage_name
 from loopwright.service.jobs.job_figures import job_figures
 from loopwright.service.results import GainsView
 from loopwright.service.store.database import FILE
@@ -254,3 +255,10 @@ def test_ticks_and_ranges() -> None:
 )
 def test_numbers(value: float | None, text: str) -> None:
     assert numbers.significant(value) == text
+
+
+def test_a_step_that_follows_a_relay_is_said_not_to_begin_at_rest() -> None:
+    """Its overshoot in the picture is not that of the gains."""
+    assert mark_names(["preflight", "relay", "design", "verify"])[-1] == "Step, from where the relay left PV"
+    assert mark_names(["preflight", "pulses", "design", "verify"])[-1] == "Step, from where the pulses left PV"
+    assert mark_names(["preflight", "verify"])[-1] == stage_name("verify")

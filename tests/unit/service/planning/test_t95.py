@@ -51,8 +51,10 @@ def test_the_lag_of_a_level_is_not_held_against_the_configuration() -> None:
         ([1.0, -2e-5], [0.0, 4e-5], True),
         ([1.0, 0.2, 3e-4], [0.0, 0.01, 2e-4], True),
         ([1.0, 0.2, 0.0], None, True),
+        ([1.0, 2474.0, 0.0023], [0.0, 193.0, 0.0008], True),  # of a record without noise
         ([1.0, 0.1], [0.0, 0.01], False),
-        ([1.0, 7.09e-5], None, False),
+        ([1.0, 7.09e-5], None, True),
+        ([1.0, 0.01], None, False),
         ([1.0], None, False),
     ],
 )

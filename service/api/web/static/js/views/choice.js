@@ -62,10 +62,10 @@ export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
           onDblClick=${() => setMs(tested)} onKeyDown=${(/** @type {any} */ e) => slide(e, tested, designs, setMs)} />
         <div class="ends"><span>${msText(designs[0].ms)} robust</span>${asked && html`<span class="quiet">asking for the designs…</span>`}<span>fast ${msText(designs[designs.length - 1].ms)}</span></div></div>`}
       ${after && html`<div class="small-plots" key="plots">
-        <figure><figcaption><b>Set-point step</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(small, before?.setpoint ?? null, after.setpoint, size, true, "Set-point step before and after")}</figure>
+        <figure><figcaption><b>Set-point step</b> PV, ${unit(loop.pv_unit)}, by the model</figcaption>${StepPlot(small, before?.setpoint ?? null, after.setpoint, size, true, "Set-point step before and after")}</figure>
         <figure><figcaption><b>Load step of ${LOAD_PCT} %</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(small, before?.load ?? null, after.load, LOAD_PCT, false, "Load step before and after")}</figure>
         <figure><figcaption><b>Distance from −1</b> Nyquist</figcaption>${NyquistPlot(narrow ? small : 0.8 * small, before, after, Ms)}</figure></div>
-        <div class="legend" key="legend" style=${{ marginTop: "8px" }}><span class="old">before</span><span class="new">${atTested ? name : "chosen"}</span><span class="quiet">computed on the model</span></div>`}
+        <div class="legend" key="legend" style=${{ marginTop: "8px" }}><span class="old">before</span><span class="new">${atTested ? name : "chosen"}</span></div>`}
       ${!after && html`<p class="quiet" key="no-plots">${asked ? "asking for the curves…" : state.value === "done" ? "The service has no curves for these gains." : ""}</p>`}
     </div><div>${Table(loop, job, chosen, old, atTested, size, found)}${!job.reason && verdict && html`<p class="note" key="verdict">${verdict}</p>`}</div></div>
     ${!quiet && html`<${Decide} key="decide" loop=${loop} detail=${detail} job=${job} latest=${latest} ms=${ms} tested=${tested} atTested=${atTested} back=${() => setMs(tested)} onChanged=${onChanged} />`}

@@ -148,10 +148,15 @@ function Unlock({ tag }) {
 }
 
 /** The focus goes from the form, which is gone, to the test that it has started, once it is drawn. */
-function focusTest(tries = 40) {
-  const test = document.getElementById("under-test");
-  if (test) test.focus({ preventScroll: true });
-  else if (tries && (document.activeElement === document.body || !document.activeElement)) setTimeout(() => focusTest(tries - 1), 100);
+function focusTest() {
+  const from = document.activeElement;
+  let tries = 50;
+  const timer = setInterval(() => {
+    const test = document.getElementById("under-test");
+    const moved = document.activeElement !== from && document.activeElement !== document.body; // by a person, meanwhile
+    if (test && !moved) test.focus({ preventScroll: true });
+    if (test || moved || !--tries) clearInterval(timer);
+  }, 100);
 }
 
 /** @param {any} loop @param {any} detail */
