@@ -13,9 +13,12 @@ from fastapi.testclient import TestClient
 from loopwright.service.api.app import create_app
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.gate.bodies import SMALL
+from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.places import DECIDES, kind_of
 from loopwright.service.inputs.request import FastRetune
+from loopwright.service.security.keys import Scope
 from loopwright.service.server.assembly import make_jobs
+from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
 from tests.unit.service.fakes import TAG, FakeController, FakeLoop, FakeTune, Service, ThreadEngine, fake_rehearse
 from tests.unit.service.postgres import Server
@@ -130,3 +133,90 @@ def test_text_that_no_database_keeps(path: str, tmp_path: Path, postgres: Server
         assert answer.status_code == 422 and "NUL" in answer.json()["detail"], answer.text
     finally:
         store.close()
+
+
+# numbers, flags and texts are what they are in JSON
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "where"),
+    [
+        (POSTS[0], {"ms": "1.6"}, "body.ms"),
+        (POSTS[0], {"ms": True}, "body.ms"),
+        (POSTS[0], {"derivative": "true"}, "body.derivative"),
+        (POSTS[0], {"dry_run": 0}, "body.dry_run"),
+        (POSTS[0], {"amplitude_pct": "10"}, "body.amplitude_pct"),
+        (POSTS[0], {"requested_by": 7}, "body.requested_by"),
+        (POSTS[0], {"method": "five-stage", "overshoot_window_pct": [10, "50"]}, "body.overshoot_window_pct.1"),
+        (POSTS[0], {"dry_run": True, "plant": {"num": ["1"], "den": [1, 1]}}, "body.plant.num.0"),
+        (POSTS[0], {"start": "design", "model": {"K": "1", "T_s": 3, "L_s": 1}}, "body.model.K"),
+        (POSTS[1], {"sp_deviation": "2"}, "body.sp_deviation"),
+        ("/retunes", {"pattern": "*", "at_once_per_bus": "2"}, "body.at_once_per_bus"),
+        ("/retunes", {"pattern": "*", "stop_after_failures": True}, "body.stop_after_failures"),
+        ("/tunings", {"model": {"K": 1, "T_s": "3", "L_s": 1}}, "body.model.T_s"),
+        (f"/loops/{TAG}/lock", {"reason": 5}, "body.reason"),
+        ("/jobs/none/accept", {"roll_back_by_itself": "no"}, "body.roll_back_by_itself"),
+    ],
+)
+def test_strict_types(shared_client: TestClient, path: str, body: dict[str, Any], where: str) -> None:
+    answer = refused(shared_client, path, json.dumps({"requested_by": "me"} | body if path in POSTS[:3] else body))
+    assert answer.status_code == 422 and where in [each["where"] for each in answer.json()["errors"]], answer.text
+
+
+def test_whole_numbers_may_be_written_as_floats_and_a_query_is_text(shared_client: TestClient) -> None:
+    plant = {"num": [2], "den": [3, 1], "seed": 3.0}
+    assert shared_client.post(POSTS[1], json={"dry_run": True, "plant": plant, "ms": 2}).status_code == 200
+    assert shared_client.get("/jobs?limit=2").status_code == 200
+
+
+@pytest.mark.parametrize("content", [None, b"", b"null"])
+def test_no_test_begins_without_a_body(client: TestClient, service: Service, content: bytes | None) -> None:
+    answer = client.post(POSTS[0], content=content, headers=JSON if content else {})
+    assert answer.status_code == 422 and '{"requested_by": "YOUR NAME"}' in answer.json()["detail"]
+    assert client.post(POSTS[1]).status_code == 200, "a preview needs none"
+    assert not service.store.recent()
+
+
+@pytest.mark.parametrize("body", [{}, {"requested_by": " "}, {"requested_by": None, "ms": 1.4}])
+def test_a_test_is_signed_where_no_key_names_the_caller(
+    client: TestClient, service: Service, body: dict[str, Any]
+) -> None:
+    for path, more in ((POSTS[0], {}), ("/retunes", {"pattern": "*"})):
+        answer = client.post(path, json=body | more)
+        assert answer.status_code == 422 and answer.json()["errors"][0]["where"] == "body.requested_by"
+    assert not service.store.recent()
+    assert client.post(POSTS[0], json=body | {"dry_run": True}).status_code == 202
+
+
+def test_the_key_names_who_does_not_say_it(service: Service) -> None:
+    keyring = Keyring(service.store.engine)
+    _, key = keyring.create("control room", Scope.OPERATE)
+    client = TestClient(create_app(service.jobs, Policy(keyring)), headers={"Authorization": f"Bearer {key}"})
+    job = client.post(POSTS[0], json={}).json()
+    assert job["requested_by"] == "control room"
+    assert client.post(POSTS[0]).status_code == 422, "a body it needs all the same"
+
+
+@pytest.mark.parametrize(
+    ("content", "headers", "by"),
+    [
+        (None, {}, "local"),
+        (b"by=me", {"Content-Type": "application/x-www-form-urlencoded"}, "local"),
+        (b'{"by": "A. Lind"}', {"Content-Type": "text/plain"}, "A. Lind"),
+        (b'{"by": "A. Lind"}', {}, "A. Lind"),
+        (b'{"by": 5}', JSON, "local"),
+        (b"[" * 3000, JSON, "local"),
+        (b'{"by": "\xff"}', JSON, "local"),
+        (b"null", JSON, "local"),
+    ],
+)
+def test_nothing_in_a_body_is_a_reason_not_to_stop(
+    client: TestClient, service: Service, content: bytes | None, headers: dict[str, str], by: str
+) -> None:
+    service.tune.hold.clear()
+    job = service.jobs.start(TAG, FastRetune()).id
+    assert service.tune.inside.wait(60)
+    assert client.post(f"/jobs/{job}/abort", content=content, headers=headers).status_code == 202
+    service.tune.hold.set()
+    service.wait(job)
+    assert client.get(f"/jobs/{job}").json()["stopping"]["by"] == by

@@ -93,15 +93,6 @@ async function asked(path, stop) {
   }
 }
 
-/** @param {Headers} headers @returns {string | null} where the next page of a list is */
-const nextOf = (headers) => /<([^>]+)>;\s*rel="next"/.exec(headers.get("Link") ?? "")?.[1] ?? null;
-
-/** Asks for one page of a list. @param {string} path @returns {Promise<{entries: any[], next: string | null}>} */
-export async function askPage(path) {
-  const { found, headers } = await asked(path);
-  return { entries: found, next: nextOf(headers) };
-}
-
 /** Asks for a list with all its pages. @param {string} path @returns {Promise<any[]>} */
 export async function askAll(path) {
   /** @type {any[]} */
@@ -112,7 +103,7 @@ export async function askAll(path) {
     /** @type {{found: any, headers: Headers}} */
     const { found, headers } = await asked(next);
     all.push(...found);
-    next = nextOf(headers);
+    next = /<([^>]+)>;\s*rel="next"/.exec(headers.get("Link") ?? "")?.[1] ?? null;
   }
   return all;
 }
