@@ -27,7 +27,7 @@ ONLY_FIVE = (FIVE,)
         ({"num": [1], "den": [10, 0], "dead_time_s": 1}, ONLY_FIVE, "refused", "not_self_regulating"),
         ({"num": [0.2], "den": [10, 1, 0], "dead_time_s": 3}, ONLY_FIVE, "refused", "not_self_regulating"),
         (LAG | {"sample_time_s": 1.0}, ONLY_FIVE, "refused", "cannot_oscillate"),
-        ({"num": [1], "den": [-5, 1], "dead_time_s": 1}, BOTH, "failed", "pv_limit"),
+        ({"num": [1], "den": [-5, 1], "dead_time_s": 1}, BOTH, "refused", "wrong_sign"),
         (LAG | {"noise_std": 0.1}, BOTH, "refused", "noise_too_high"),
         (LAG | {"mv_limits": [-0.001, 0.5]}, BOTH, "refused", "saturated"),
         (LAG | {"mv_limits": [5, 1]}, BOTH, "refused", "bad_input"),

@@ -11,9 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def as_html(
-    title: str, rows: Sequence[Sequence[str]], notes: Sequence[str], draw: Callable[[], Figure] | None
-) -> str:
+def as_html(title: str, rows: Sequence[Sequence[str]], notes: Sequence[str], draw: Callable[[], Figure] | None) -> str:
     """Returns a result as HTML.
 
     rows: the cells of a table; the first row has the headings.

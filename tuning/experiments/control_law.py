@@ -141,9 +141,7 @@ def alternatives(said: Gains, Ts: float) -> tuple[AlternativeLaw, ...]:
             said.b,
             by_setpoint=True,
         ),
-        AlternativeLaw(
-            LawDifference.GAIN, lambda gains, size: ControlLaw(replace(gains, Kp=size * gains.Kp)), factors
-        ),
+        AlternativeLaw(LawDifference.GAIN, lambda gains, size: ControlLaw(replace(gains, Kp=size * gains.Kp)), factors),
         AlternativeLaw(LawDifference.INTEGRAL_TIME, _integral_time, factors),
         AlternativeLaw(LawDifference.PV_FILTER, lambda gains, size: ControlLaw(gains, size), times, 0.0),
     )

@@ -61,9 +61,7 @@ class ControlRecord:
         return sum(len(each.mv) for each in self.pieces)
 
 
-def control_record(
-    facts: Facts, trace: Trace, gains: Sequence[tuple[int, int, Gains]]
-) -> ControlRecord:
+def control_record(facts: Facts, trace: Trace, gains: Sequence[tuple[int, int, Gains]]) -> ControlRecord:
     """What a trace shows of its controller.
 
     gains: which gains were in effect, and from which sample to which (exclusive).

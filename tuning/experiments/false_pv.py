@@ -1,5 +1,5 @@
-"""A PV that is false within its limits, told sample by sample: it stands still, changes its noise, or jumps, as the plant
-cannot.
+"""A PV that is false within its limits, told sample by sample: it stands still, changes its noise, or jumps, as the
+plant cannot.
 
 What PV does at rest is learned first (`PvAtRest`): how long it stays exactly equal, how often it is renewed, its noise
 and its quantum. A test then hands over each sample (`PvWatch`), and hears at once where PV is
@@ -9,9 +9,9 @@ and its quantum. A test then hands over each sample (`PvWatch`), and hears at on
 - elsewhere within one sample, by hundreds of noises and far more than it ever moved, without the way there that a lag
   takes, and stays there for longer than a few wrong samples do.
 
-Of a PV without noise, or rounded so coarsely that noise does not move it, equal values say little: it is false where it
-does not answer a move of MV in a time that no dead time takes, or stops from one sample to the next in the middle of its
-way, with MV away from where PV was at rest. What is not told by that the test's own waits have to bound.
+Of a PV without noise, or rounded so coarsely that noise does not move it, equal values say little: it is false where
+it does not answer a move of MV in a time that no dead time takes, or stops from one sample to the next in the middle of
+its way, with MV away from where PV was at rest. What is not told by that the test's own waits have to bound.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtri
 
+from loopwright.tuning.experiments.primitives import Array
 from loopwright.tuning.reasons import FalsePv, Reason
 
 MIN_RENEWALS = 30
@@ -33,8 +34,9 @@ MIN_REVERSALS, MIN_LEVELS, MAX_RUN_PART = 8, 3, 0.25
 this part of the rest. Of two values alone nothing is known of the noise between them."""
 RUN_OF_REST, RUN_MORE = 2, 10
 """PV is equal for too long after so many times the longest run at rest and so many samples more."""
-RARE = 1e-8
-"""Probability, by its noise alone, of what a true PV is taken for false for, in one look."""
+RARE, RARE_QUIET = 1e-8, 3e-7
+"""Probability, by its noise alone, of what a true PV is taken for false for, in one look: of a run of equal values, and
+of a variance that small over one of WINDOWS, which only a PV that stands still can have."""
 LONGEST_BY_CHANCE = 120
 """Longest run, in renewals, that is waited for where rounding and noise permit it. Beyond that noise says nothing."""
 WINDOWS = (8, 10, 12, 14, 16, 18, 20, 23, 26, 30, 35, 40)
@@ -43,12 +45,16 @@ QUIETER_THAN_REST = 0.5
 """Part of the smallest variance at rest over as many samples, below which that of a false PV is."""
 COARSE = 1.0
 """Quantum in noises above which PV may be equal by chance for so long that its variance says nothing."""
-LOUD_WINDOW, LOUD_VALUES, LOUD = 15, 7, 2.3
-"""PV is too loud where so many of so many values are off their median by more than so many noises: a few wrong samples
-are not."""
-WHITE = 1.2
-"""Smallest ratio of von Neumann of noise around a PV that stands still (2 on average); it is far smaller where PV
-moves."""
+LOUD = {15: (4.5, 2.8), 20: (4.0, 2.5), 26: (3.5, 2.3)}
+"""PV is too loud where, over so many values, the mean square of what does not lie between its neighbours exceeds this
+multiple of the variance at rest, without the OUTLIERS_BETWEEN largest (which a jump, or a wrong sample, makes), and
+that of the distance from the median the second one, without the OUTLIERS farthest. Of white noise the first is met by
+chance once in 1e5, whatever way PV moves."""
+OUTLIERS_BETWEEN, OUTLIERS = 4, 3
+LOUD_WINDOW = 15
+WHITE = 0.6
+"""Smallest ratio of von Neumann of noise around a PV that stands still, without the two largest differences; it is far
+smaller where PV moves."""
 JUMP_NOISES, JUMP_MOVES = 100.0, 20.0
 """A jump is at least so many noises, and so many times the largest move within a sample so far."""
 JUMP_STAYS, JUMP_BAND = 6, 0.25
@@ -70,11 +76,12 @@ LONGEST_REST = 20_000
 class PvAtRest:
     """What PV does at rest.
 
-    samples: their number.  value: the mean, PV units.
+    samples: their number.  value, last: the mean and the last of them, PV units; nan where there is none.
     longest_run: the largest number of samples in a row that were exactly equal.
     renewal: the number of samples from one new value to the next.
     noise: the standard deviation of PV around a mean that stands still, PV units; the larger of that by differences and
     that over LOUD_WINDOW values.  least_noise: the smaller of both.
+    loud_variance: the variance beside which PV is too loud: that noise squared, and more as it is less well known.
     quantum: the smallest distance of two values, PV units.
     largest_move: the largest move from one sample to the next, PV units.
     run_limit: the number of equal samples in a row from which PV is false; None where noise does not move PV.
@@ -83,10 +90,12 @@ class PvAtRest:
 
     samples: int
     value: float
+    last: float
     longest_run: int
     renewal: int
     noise: float
     least_noise: float
+    loud_variance: float
     quantum: float
     largest_move: float
     run_limit: int | None
@@ -99,7 +108,7 @@ class PvAtRest:
         n = len(x)
         if n < 2:
             value = float(x[0]) if n else math.nan
-            return cls(n, value, n, 1, 0.0, 0.0, 0.0, 0.0, None, (0.0,) * len(WINDOWS))
+            return cls(n, value, value, n, 1, 0.0, 0.0, 0.0, 0.0, 0.0, None, (0.0,) * len(WINDOWS))
         edges = np.flatnonzero(np.diff(x)) + 1
         runs = np.diff([0, *edges, n])
         longest = int(runs.max())
@@ -124,10 +133,25 @@ class PvAtRest:
             if quantum <= COARSE * math.sqrt(small):
                 for at, w in enumerate(WINDOWS):
                     if w in variances:
-                        by_noise = small * float(fdtri(w - 1, len(values) // 2, RARE))
+                        by_noise = small * float(fdtri(w - 1, len(values) * 2 // 3, RARE_QUIET))
                         least[at] = min(by_noise, QUIETER_THAN_REST * float(variances[w].min()))
         noise, least_noise = (math.sqrt(each(by_differences, over)) for each in (max, min))
-        return cls(n, float(np.mean(x)), longest, renewal, noise, least_noise, quantum, largest, limit, tuple(least))
+        loud = noise**2 * (1.0 + 2.0 / math.sqrt(max(len(values), 1)))
+        loud += 0.25 * quantum**2 if quantum > 0.5 * noise else 0.0  # in the middle between two values PV is louder
+        return cls(
+            samples=n,
+            value=float(np.mean(x)),
+            last=float(x[-1]),
+            longest_run=longest,
+            renewal=renewal,
+            noise=noise,
+            least_noise=least_noise,
+            loud_variance=loud,
+            quantum=quantum,
+            largest_move=largest,
+            run_limit=limit,
+            least_variances=tuple(least),
+        )
 
     @property
     def lively(self) -> bool:
@@ -144,8 +168,9 @@ def check_end_of_rest(pv: Sequence[float]) -> None:
         raise FalsePv(Reason.PV_FROZEN, f"PV is exactly {pv[-1]:.6g} for the last {run} samples at rest, {text}")
 
 
-def _variances(values: np.ndarray, window: int) -> np.ndarray:
-    return np.lib.stride_tricks.sliding_window_view(values, window).var(axis=1, ddof=1)
+def _variances(values: Array, window: int) -> Array:
+    variances: Array = np.lib.stride_tricks.sliding_window_view(values, window).var(axis=1, ddof=1)
+    return variances
 
 
 def _longest_by_chance(quantum: float, variance: float) -> float:
@@ -173,7 +198,7 @@ class PvWatch:
         self._low, self._high = mv_low, mv_high
         self._hair = 1e-3 * abs(mv_high - mv_low) if math.isfinite(mv_high - mv_low) else 0.0
         self._n = 0
-        self._last = math.nan
+        self._last = rest.last
         self._run = 1
         self._longest_run = 0
         """The longest run since the first move of MV that PV has ended."""
@@ -188,7 +213,7 @@ class PvWatch:
         self._changes: deque[tuple[float, int]] = deque(maxlen=STEADY_CHANGES)
         """The last moves of PV, and the number of samples for which it was equal before each."""
         length = max(WINDOWS) + 1
-        self._values: deque[float] = deque(maxlen=LOUD_WINDOW)
+        self._values: deque[float] = deque(maxlen=max(LOUD))
         self._sums: deque[float] = deque([0.0], maxlen=length)
         self._squares: deque[float] = deque([0.0], maxlen=length)
 
@@ -218,7 +243,7 @@ class PvWatch:
                 self._answer_due = self._n
 
     def _ends_run(self, pv: float) -> None:
-        if self._n > 1:
+        if not math.isnan(self._last):
             self._longest_run = max(self._longest_run, self._run)
             self._changes.append((pv - self._last, self._run))
         self._run, self._answer_due = 1, None
@@ -267,31 +292,41 @@ class PvWatch:
         for window, least in zip(WINDOWS, rest.least_variances, strict=True):
             if window > count:
                 break
+            if not least or self._run > (window - 1) * rest.renewal:
+                continue  # equal values are told as such
             total = sums[-1] - sums[-1 - window]
             variance = (squares[-1] - squares[-1 - window] - total * total / window) / (window - 1)
             if variance < least:
                 self._false_noise(pv, window, math.sqrt(max(variance, 0.0)))
-        if len(self._values) == LOUD_WINDOW and self._jump is None:
+        if count >= LOUD_WINDOW and self._jump is None:
             self._check_loud(pv)
 
     def _check_loud(self, pv: float) -> None:
-        rest, values = self._rest, self._values
-        far = LOUD * rest.noise + (rest.quantum if rest.quantum > 0.5 * rest.noise else 0.0)
-        ordered = sorted(values)
-        if ordered[-1] - ordered[0] < far:
+        """Looks at the noise where the plain variance is large at all, which the way of PV makes large too."""
+        usual = self._rest.loud_variance
+        total = self._sums[-1] - self._sums[-1 - LOUD_WINDOW]
+        squares = self._squares[-1] - self._squares[-1 - LOUD_WINDOW]
+        if squares - total * total / LOUD_WINDOW < LOUD_WINDOW * usual:
             return
-        median = ordered[LOUD_WINDOW // 2]
-        if sum(abs(value - median) > far for value in values) < LOUD_VALUES:
-            return
-        x = np.asarray(values)
-        squares = float(np.sum((x - x.mean()) ** 2))
-        if float(np.sum(np.diff(x) ** 2)) > WHITE * squares:
-            self._false_noise(pv, LOUD_WINDOW, math.sqrt(squares / (LOUD_WINDOW - 1)))
+        values = np.asarray(self._values)
+        for window, (between, around) in LOUD.items():
+            if window > len(values):
+                return
+            x = values[-window:]
+            steps = np.diff(x)
+            off = np.sort((0.5 * np.diff(steps)) ** 2)[: window - 2 - OUTLIERS_BETWEEN]
+            if float(np.mean(off)) < between * usual:
+                continue
+            away = np.sort((x - np.median(x)) ** 2)[: window - OUTLIERS]
+            white = np.sort(steps**2)[: window - 3]
+            around_mean = float(np.sum((x - np.mean(x)) ** 2))
+            if float(np.mean(away)) > around * usual and float(np.sum(white)) > WHITE * around_mean:
+                self._false_noise(pv, window, math.sqrt(around_mean / (window - 1)))
 
     def _false_noise(self, pv: float, values: int, noise: float) -> None:
         rest = self._rest
-        samples = values * rest.renewal
-        text = f"PV stands at {rest.value + sum(self._values) / len(self._values):.6g} for {samples} samples"
+        mean = rest.value + (self._sums[-1] - self._sums[-1 - values]) / values
+        text = f"PV stands at {mean:.6g} for {values * rest.renewal} samples"
         shown = f"with noise of {noise:.3g}, {noise / rest.noise:.2g} times that at rest ({rest.noise:.3g})"
         raise FalsePv(Reason.PV_FROZEN, f"{text}, {shown}")
 
@@ -302,7 +337,7 @@ class PvWatch:
         if self._jump is not None:
             self._go_on_with_jump(self._jump, pv)
             return
-        if self._n < 2:
+        if math.isnan(self._last):
             return
         move = pv - self._last
         known = rest.lively or len(self._changes) == STEADY_CHANGES

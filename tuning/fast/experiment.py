@@ -94,9 +94,7 @@ class Experiment:
             return control_record(facts, trace, [(0, samples, facts.old_gains)])
         moved = np.flatnonzero(np.diff(trace.sp[self._steps[0] - 1 :]))
         begun = self._steps[0] + int(moved[0]) if len(moved) else samples
-        return control_record(
-            facts, trace, [(0, self.excited, facts.old_gains), (begun, samples, self._gains_tried)]
-        )
+        return control_record(facts, trace, [(0, self.excited, facts.old_gains), (begun, samples, self._gains_tried)])
 
     @property
     def _direction(self) -> float:

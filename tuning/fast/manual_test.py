@@ -13,6 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from loopwright.tuning.experiments.half_wave import has_moved
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
 from loopwright.tuning.fast.experiment import Experiment
 from loopwright.tuning.fast.manual_sizes import ManualRecord, first_pulse, largest_pulse, next_pulse, pv_bounds
@@ -41,7 +42,10 @@ MIN_BACK_NOISES = 4.0
 BACK_T95, BACK_PULSES = 2.0, 6.0
 """The longest wait for that, the longer of so many T95 and so many times the first pulse."""
 RAISE, MAX_RAISES = 4.0, 3
-"""Factor by which a pulse is raised that PV has not answered, and how often."""
+"""Factor by which a pulse is raised that PV has hardly answered, and how often. One that has not moved PV beyond its
+noise is not raised: a sensor that has ended, or a valve that does not move, is not told from it."""
+LEAST_STEPS = 1e-3
+"""Smallest move of a PV without noise, in permitted steps."""
 SAMPLES_TO_FOLLOW = 30
 """Number of samples after which MV has to have followed the manual output, or to be on its way."""
 HAIR = 1e-4
@@ -104,7 +108,8 @@ class ManualTest(Experiment):
             is_largest = raised == MAX_RAISES or self.size >= self.largest
             if self._farthest >= (TURN_NOISES * self.noise if is_largest else self._turns_at):
                 return (yield from self._until_back(width))
-            if not is_largest:
+            moved = has_moved(self.trace.pv[self._begun :], self.noise, LEAST_STEPS * self.facts.sp_deviation)
+            if not is_largest and moved:
                 size = min(RAISE * self.size, self.largest)
                 yield from self.report(
                     Note(f"PV hardly answers a pulse of {self.size:.3g} of MV: the next one has {size:.3g}")
@@ -116,6 +121,8 @@ class ManualTest(Experiment):
             f"a pulse of {self.size:.4g} of MV, {width * self.facts.sample_time_s:.3g} s long, moved PV by "
             f"{self._farthest:.3g}, and {TURN_NOISES:g} times the noise of {self.noise:.3g} are needed"
         )
+        if not is_largest:
+            text += "; a PV that has not moved beyond its noise gets no larger pulse"
         raise Refused(Reason.NO_RESPONSE, text)
 
     def pulse(self, width: int) -> Plan[bool]:

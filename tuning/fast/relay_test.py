@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from loopwright.tuning.experiments.half_wave import HalfWaves, has_moved
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, no_oscillation
 from loopwright.tuning.fast.experiment import VERIFICATION_PERIODS, Experiment
 from loopwright.tuning.fast.proposal import RelayFigures
@@ -85,6 +86,8 @@ class RelayTest(Experiment):
         self._sides = [BIAS, 1.0]  # low, high, in amplitudes
         self._high = True
         self._raise_at = 0
+        self._goes_wrong = False
+        self._half_waves = HalfWaves(facts, point, self.noise, self._hysteresis)
 
     def relay_figures(self) -> RelayFigures:
         """The figures of the relay test so far."""
@@ -112,7 +115,7 @@ class RelayTest(Experiment):
             self._commands = (*home, self._relay_command(), SetMode(Mode.EXPERIMENT))
         while len(self.switches) < switches:
             self._commands = self._on_sample((yield self._commands))
-            if self._time_is_over():
+            if self._goes_wrong or self._time_is_over():
                 if len(self.switches) < MIN_SWITCHES:
                     raise self._stalled()
                 return False
@@ -167,9 +170,13 @@ class RelayTest(Experiment):
         at = len(trace) - 1
         if sample.mode != Mode.EXPERIMENT or self._stepping:
             return ()
+        self._goes_wrong = self._half_waves.goes_wrong(sample.pv, self._high == self.facts.reverse)
+        if self._goes_wrong and len(self.switches) < 2:
+            raise self._half_waves.wrong_sign() if not self.switches else self._no_oscillation()
         high = sample.mv > self.point.mv
         if high != self._high:
             self._high = high
+            self._half_waves.switched()
             self.switches.append(at)
             if len(self.switches) == 2 and not self._fixed:
                 return self._adapted()
@@ -184,13 +191,14 @@ class RelayTest(Experiment):
                 side = int(high)
                 maximum = self._max * (1.0 if high else BIAS) / self.amplitude
                 raised = min(RAISE_FACTOR * self._sides[side], MAX_RAISE * (1.0, BIAS)[not high], maximum)
-                if raised > self._sides[side]:
+                if raised > self._sides[side] and self._moved_since(self.switches[-1]):
                     self._sides[side] = raised
                     return (self._relay_command(),)
         return ()
 
     def _adapted(self) -> tuple[Command, ...]:
-        """Adapts the amplitude after the first wave: up where PV hardly exceeds the noise, down where PV moved too far.
+        """Adapts the amplitude after the first wave: up where PV hardly exceeds the noise, but has moved beyond it
+        since the first switch, down where PV moved too far.
 
         Raises Refused, NO_RESPONSE: MV has switched, and PV stands still.
         """
@@ -202,7 +210,7 @@ class RelayTest(Experiment):
                 f"the relay of {self.amplitude:.4g} has switched twice, and PV is exactly {self.trace.pv[-1]:.6g} "
                 f"all the time (noise {self.noise:.3g} before)",
             )
-        if seen < MIN_OUTPUT_RANGE * self.noise:
+        if seen < MIN_OUTPUT_RANGE * self.noise and self._moved_since(self.switches[0]):
             factor = min(GOOD_OUTPUT_RANGE * self.noise / seen, self._max / self.amplitude)
         elif seen > MAX_OUTPUT_RANGE * self.facts.sp_deviation:
             factor = max(MAX_OUTPUT_RANGE * self.facts.sp_deviation, MIN_OUTPUT_RANGE * self.noise) / seen
@@ -213,9 +221,16 @@ class RelayTest(Experiment):
 
     def _relay_command(self) -> SetRelay:
         low, high = (self.amplitude * side for side in self._sides)
-        hysteresis = max(HYSTERESIS * self.noise, MIN_HYSTERESIS * self.facts.sp_deviation)
         average = SAMPLES_AVERAGED if self.noise > 0.0 else 1
-        return SetRelay(high, hysteresis, self.point.mv, amplitude_low=low, average=average)
+        return SetRelay(high, self._hysteresis, self.point.mv, amplitude_low=low, average=average)
+
+    @property
+    def _hysteresis(self) -> float:
+        return max(HYSTERESIS * self.noise, MIN_HYSTERESIS * self.facts.sp_deviation)
+
+    def _moved_since(self, sample: int) -> bool:
+        """Whether PV has moved beyond its noise since this sample."""
+        return has_moved(self.trace.pv[sample:], self.noise, MIN_HYSTERESIS * self.facts.sp_deviation)
 
     def _time_is_over(self) -> bool:
         """Whether the time of the relay is over. The limit comes from T95 before the second switch, and from the half
@@ -223,12 +238,15 @@ class RelayTest(Experiment):
         passed = len(self.trace) - self._begun
         if len(self.switches) < 2:
             if passed * self.facts.sample_time_s > max(3.0 * self.facts.T95_s, 40 * self.facts.sample_time_s):
-                point = replace(self.point, room=self.amplitude)  # the message names the amplitude of the relay
-                raise no_oscillation(self.facts, point, self._since(), len(self.switches))
+                raise self._no_oscillation()
             return False
         halves = np.diff(self.switches)
         known = period(tuple(self.switches)) if len(halves) >= 2 else 2.0 * float(halves[0])
         return passed > MAX_PERIODS * max(known, 2.0 * float(np.max(halves)) if len(halves) < 3 else 0.0)
+
+    def _no_oscillation(self) -> Refused:
+        point = replace(self.point, room=self.amplitude)  # the message names the amplitude of the relay
+        return no_oscillation(self.facts, point, self._since(), len(self.switches))
 
     def _since(self) -> Trace:
         trace, at = self.trace, self._begun

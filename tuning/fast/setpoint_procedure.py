@@ -110,4 +110,3 @@ def by_pulses(
         comparison = outcome
     begun_at_s = test.trace.t[test.listened]
     return (yield from test.computed(partial(proposed, method, facts, spec, evaluation, comparison, shown, begun_at_s)))
-

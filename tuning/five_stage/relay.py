@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from loopwright.tuning.experiments.half_wave import HalfWaves
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, no_oscillation, to_rest
 from loopwright.tuning.identification.oscillation import harmonic
 from loopwright.tuning.plan import Mode, Plan, SetMode, SetRelay
@@ -50,10 +51,17 @@ def relay_test(facts: Facts, point: OperatingPoint) -> Plan[RelayResult]:
     start = sample.t
     ups: list[int] = []
     was_high = True
+    half_waves = HalfWaves(facts, point, point.noise, hysteresis)
+    switches = 0
     while True:
         trace.add(sample)
         if sample.mode == Mode.EXPERIMENT:
             high = sample.mv > point.mv
+            if high != was_high:
+                half_waves.switched()
+                switches += 1
+            if half_waves.goes_wrong(sample.pv, high == facts.reverse):
+                raise no_oscillation(facts, point, trace, len(ups)) if switches else half_waves.wrong_sign()
             if high and not was_high:
                 ups.append(len(trace) - 1)
                 if _steady(trace, ups):

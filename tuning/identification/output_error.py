@@ -257,9 +257,7 @@ class Fit(Generic[S]):
         """Whether each piece begins in a state of its own under this disturbance hypothesis."""
         return hypothesis.not_at_rest_initially or self.starts_are_free
 
-    def _plants(
-        self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals
-    ) -> tuple[Pulses, Pulses]:
+    def _plants(self, structure: Structure, hypothesis: DisturbanceHypothesis, thetas: Reals) -> tuple[Pulses, Pulses]:
         """The pulse transfer functions from MV for each theta, and those from each load disturbance and from the
         start.
 

@@ -91,9 +91,7 @@ class AcceptedModel:
         plant = replace(self.plant, L=delay).frequency_response(w) * gain
         plant = plant * (1.0 + share * np.exp(-1j * w * path_s))
         gains = self.gains
-        loop: Complexes = (
-            gains.Kp * controller(w, gains.Ti, gains.Td, filter_ratio(gains)) * sign(self.plant) * plant
-        )
+        loop: Complexes = gains.Kp * controller(w, gains.Ti, gains.Td, filter_ratio(gains)) * sign(self.plant) * plant
         return float(min(1.0 / np.min(np.abs(1.0 + loop)), MAX_MS)) if np.all(np.isfinite(loop)) else MAX_MS
 
 

@@ -36,7 +36,7 @@ from loopwright.tuning.plan import (
     Work,
     worked,
 )
-from loopwright.tuning.reasons import Aborted, Failed, Reason, Refused
+from loopwright.tuning.reasons import Aborted, Failed, FalsePv, Reason, Refused
 
 TS = 0.1
 OLD = Gains(Kp=0.15, Ti=5.0)
@@ -276,8 +276,8 @@ def test_the_samples_of_a_stage_are_told_before_its_end() -> None:
 
 
 def test_a_frozen_pv_is_noticed_once_mv_has_moved() -> None:
-    result = run(trial(), loop := Meddled(100, lambda s: s._replace(pv=0.0)), limits=RunLimits(max_frozen_s=10.0))
-    assert result.ended is not None
+    result = run(trial(), loop := Meddled(0, lambda s: s._replace(pv=0.0)), limits=RunLimits(max_frozen_s=10.0))
+    assert isinstance(result.ended, FalsePv)
     assert result.ended.reason is Reason.PV_FROZEN
     assert_home(loop, result)
 
