@@ -275,11 +275,42 @@ def test_the_samples_of_a_stage_are_told_before_its_end() -> None:
     assert told == pytest.approx([TS * n for n in range(len(told))]) and len(told) == at_end[1] + 1
 
 
-def test_a_frozen_pv_is_noticed_once_mv_has_moved() -> None:
-    result = run(trial(), loop := Meddled(0, lambda s: s._replace(pv=0.0)), limits=RunLimits(max_frozen_s=10.0))
+def test_a_frozen_pv_is_noticed_once_mv_has_moved_and_the_loop_is_held() -> None:
+    notes: list[str] = []
+    loop = Meddled(0, lambda s: s._replace(pv=0.0))
+    result = run(
+        trial(), loop, limits=RunLimits(max_frozen_s=10.0),
+        on_event=lambda e: notes.append(e.text) if isinstance(e, Note) else None,
+    )  # fmt: skip
     assert isinstance(result.ended, FalsePv)
     assert result.ended.reason is Reason.PV_FROZEN
-    assert_home(loop, result)
+    state = loop.read()
+    assert result.restored == state
+    assert (state.mode, state.manual_output, state.sp) == (Mode.MANUAL, 0.0, 0.0)
+    assert (state.gains, state.on_trial) == (OLD, False)
+    assert ["PV is false: PV" in notes[0], "in manual at MV 0" in notes[1]] == [True, True], notes
+
+
+def test_a_false_pv_stays_the_reason_where_the_loop_cannot_be_held_or_read_back() -> None:
+    class Away(Meddled):
+        def hold(self) -> None:
+            raise Failed(Reason.NODE_LOST, "node 20h does not answer")
+
+        def restore(self, home: LoopState, session: int | None = None) -> Restored:
+            raise Failed(Reason.RESTORE_UNCONFIRMED, "node 20h does not answer")
+
+    def plan() -> Plan[None]:
+        yield ()
+        raise FalsePv(Reason.BAD_SAMPLE, "PV went from 1 to 2")
+
+    notes: list[str] = []
+    result = run(
+        plan(), Away(), limits=RunLimits(), on_event=lambda e: notes.append(e.text) if isinstance(e, Note) else None
+    )
+    assert isinstance(result.ended, FalsePv) and result.restored is None
+    assert notes[1:] == [
+        "the loop could not be held: node 20h does not answer", "restore: restore_unconfirmed: node 20h does not answer"
+    ]  # fmt: skip
 
 
 def test_the_time_budget_ends_the_run() -> None:
