@@ -59,8 +59,11 @@ JUMP_NOISES, JUMP_MOVES = 100.0, 20.0
 """A jump is at least so many noises, and so many times the largest move within a sample so far."""
 JUMP_STAYS, JUMP_BAND = 6, 0.25
 """PV has to stay for so many samples within this part of the jump."""
-ANSWERED_NOISES = 10.0
-"""Distance from rest, in noises, from which PV has answered MV."""
+ANSWERED_NOISES, FAR_MORE = 10.0, 3.0
+"""Distance from rest, in noises, from which PV has answered MV. The first answer to moves of MV that are so many times
+larger than any that it has answered may be as fast as a jump."""
+LARGE_NOISES = 8.0
+"""Move of PV within a sample, in noises, that is none of its noise."""
 QUIET_MORE, LARGE_MOVE = 15, 0.3
 """A PV that noise does not move has to answer a move of MV, of at least this part of MV's largest so far, within twice
 the rest's duration, which is no shorter than half of T95, and so many samples more."""
@@ -202,8 +205,11 @@ class PvWatch:
         self._run = 1
         self._longest_run = 0
         """The longest run since the first move of MV that PV has ended."""
-        self._answered = False
+        self._answered = 0.0
+        """MV's largest distance from home when PV was last away from rest: to so much it has answered."""
         self._largest = rest.largest_move
+        self._largest_of_mv = 0.0
+        """The largest move of PV within a sample, beyond its noise, over MV's largest distance from home till then."""
         self._jump: _Jump | None = None
         self._farthest_mv = 0.0
         self._moved_mv: tuple[float, int] = (mv, -1)
@@ -341,15 +347,22 @@ class PvWatch:
             return
         move = pv - self._last
         known = rest.lively or len(self._changes) == STEADY_CHANGES
-        if known and abs(move) > max(JUMP_NOISES * rest.noise, JUMP_MOVES * self._largest) > 0.0:
-            first = not self._answered and move * self._direction * (mv - self._mv_home) > 0.0
-            seldom = not self._answered and rest.renewal > 1
-            if not first and not seldom:
-                self._jump = _Jump(self._last, pv, self._largest)
+        largest = max(self._largest, self._largest_of_mv * self._farthest_mv)
+        if known and abs(move) > max(JUMP_NOISES * rest.noise, JUMP_MOVES * largest) > 0.0:
+            unknown = self._farthest_mv > FAR_MORE * self._answered
+            expected = move * self._direction * (mv - self._mv_home) > 0.0
+            if not (unknown and (expected or rest.renewal > 1)):
+                self._jump = _Jump(self._last, pv, largest)
                 return
         if abs(pv - rest.value) > ANSWERED_NOISES * rest.noise:
-            self._answered = True
-        self._largest = max(self._largest, abs(move))
+            self._answered = self._farthest_mv
+        self._moved(abs(move))
+
+    def _moved(self, move: float) -> None:
+        """Learns what a true PV moves by within a sample."""
+        self._largest = max(self._largest, move)
+        if move > LARGE_NOISES * self._rest.noise and self._farthest_mv > 0.0:
+            self._largest_of_mv = max(self._largest_of_mv, move / self._farthest_mv)
 
     def _go_on_with_jump(self, jump: _Jump, pv: float) -> None:
         rest = self._rest
@@ -357,14 +370,14 @@ class PvWatch:
         size = jump.to - jump.before
         if abs(pv - jump.to) > JUMP_BAND * abs(size):
             if abs(pv - jump.before) > JUMP_BAND * abs(size):
-                self._largest = max(self._largest, abs(size))  # it goes on: a fast plant
+                self._moved(abs(size))  # it goes on: a fast plant
             self._jump = None
             return
         ways = 2 * rest.renewal
         if jump.since == ways:
             further = math.copysign(1.0, size) * (pv - jump.to)
             if further > ways * jump.largest_move + 5.0 * rest.noise:
-                self._largest = max(self._largest, abs(size))
+                self._moved(abs(size))
                 self._jump = None
                 return
         if jump.since >= max(JUMP_STAYS, ways + 1) - 1:
