@@ -4,10 +4,10 @@ has gone by then; and how often a true one is taken for false.
 The rules were set on RULE_PLANTS, and are judged on JUDGED, which were written down before the first run and never
 looked at while a rule was set. A false sensor sends, from a moment on that is drawn within a phase: its last value,
 0.0, half its last value, half of what it should (`halved`), its last value with a quarter of its noise (`quiet`) or
-with four times of it (`loud`). The test has to end as FalsePv within 15 samples or Pu / 10, whichever is longer, and twice
-the longest run of equal values at rest; in that time and a dead time the true PV may go as far as the highest and the
-lowest MV of the test take it. A true sensor is rounded to 0.1 to 3 noises, renewed every 2 to 20 samples, without noise,
-on a fast plant, and under a stepped load.
+with four times of it (`loud`). The test has to end as FalsePv within 15 samples or Pu / 10, whichever is longer, and
+twice the longest run of equal values at rest; in that time and a dead time the true PV may go as far as the highest and
+the lowest MV of the test take it. A true sensor is rounded to 0.1 to 3 noises, renewed every 2 to 20 samples, without
+noise, on a fast plant, and under a stepped load.
 
     python -m benchmarks.false_sensor
     python -m benchmarks.false_sensor --true 100 --whole --moments 1 --plants rule

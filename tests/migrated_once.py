@@ -19,8 +19,9 @@ _ONE = threading.Lock()
 @contextmanager
 def migrated_once() -> Iterator[None]:
     """Whatever has tables already, and PostgreSQL, is left to the migrations."""
-    with closing(sqlite3.connect(":memory:", check_same_thread=False)) as made, patch.object(
-        store, "migrate", lambda engine: _migrate(engine, made)
+    with (
+        closing(sqlite3.connect(":memory:", check_same_thread=False)) as made,
+        patch.object(store, "migrate", lambda engine: _migrate(engine, made)),
     ):
         yield
 

@@ -30,9 +30,7 @@ WATCH_FAULTS = {
     "watch-mode": _fault("another node sets manual", do.foreign_mode),
     "watch-mode-twice": _fault("manual for 5 s, then automatic again", others.manual_for_a_while, WATCHED),
     "watch-rolled-back": _fault("the operator rolls back as well", others.rolled_back, OUTSIDE, WRITING),
-    "watch-locked": _fault(
-        f"database locked by another process for {LOCKED_S:.0f} s", do.database_locked(LOCKED_S)
-    ),
+    "watch-locked": _fault(f"database locked by another process for {LOCKED_S:.0f} s", do.database_locked(LOCKED_S)),
     "watch-disk-full": _fault(f"disk full for {AWAY_S:.0f} s", do.disk_full, needs=Needs(small_disk=True)),
 }
 ALL_FAULTS = FAULTS | WATCH_FAULTS

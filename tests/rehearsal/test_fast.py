@@ -135,8 +135,14 @@ def test_what_can_be_allowed_for_does_not_hinder(case: str) -> None:
 @pytest.mark.parametrize("method", ["fast", "setpoint"])
 def test_a_heater_that_settles_in_time_and_moves_MV_no_further(method: str) -> None:
     """On the true plant, which the model of a noisy record is near to."""
-    plant = {"num": [0.8], "den": [120.0, 1.0], "dead_time_s": 15.0, "sample_time_s": 1.0, "noise_std": 0.002,
-             "sp_deviation": 1.0}
+    plant = {
+        "num": [0.8],
+        "den": [120.0, 1.0],
+        "dead_time_s": 15.0,
+        "sample_time_s": 1.0,
+        "noise_std": 0.002,
+        "sp_deviation": 1.0,
+    }
     answer = rehearse(plant, method=method, settling_s=100.0, mv_peak=4.0)
     assert answer["outcome"] == "proposed", answer["detail"]
     compared, chosen = answer["comparison"], answer["chosen"]
@@ -160,8 +166,14 @@ def test_a_heater_that_settles_in_time_and_moves_MV_no_further(method: str) -> N
 @pytest.mark.parametrize("method", ["fast", "setpoint"])
 def test_a_heater_without_overshoot(method: str) -> None:
     """K 0.8, T 120 s, L 15 s overshot by 20 % under the gains of this design with b = 1."""
-    plant = {"num": [0.8], "den": [120.0, 1.0], "dead_time_s": 15.0, "sample_time_s": 1.0, "noise_std": 0.002,
-             "sp_deviation": 1.0}
+    plant = {
+        "num": [0.8],
+        "den": [120.0, 1.0],
+        "dead_time_s": 15.0,
+        "sample_time_s": 1.0,
+        "noise_std": 0.002,
+        "sp_deviation": 1.0,
+    }
     found = {aim: rehearse(plant, method=method, aim=aim) for aim in ("balanced", "no_overshoot")}
     model = TransferFunction((0.8,), (120.0, 1.0), 15.5)
     overshoots, IAE = {}, {}

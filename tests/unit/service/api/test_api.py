@@ -215,9 +215,7 @@ def test_samples_as_columns_and_as_csv(service: Service, client: TestClient) -> 
     assert lines[0] == "stage,t_s,sp,pv,mv,mode" and lines[1] == "relay,1.1,50.0,50.0,40.0,2" and len(lines) == 11
 
 
-def test_a_t95_that_is_wrong_is_noted(
-    service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_t95_that_is_wrong_is_noted(service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     """The plant of these tests has about the T95 of its configuration, 9 s."""
     monkeypatch.setattr(worker, "t95_mismatch", lambda model, t95_s: t95_mismatch(model, 10.0 * t95_s))
     job = finished(service, client)

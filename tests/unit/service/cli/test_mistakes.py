@@ -1,6 +1,6 @@
 """Mistakes that people make, each with what the real command answers: docs/mistakes.md.
 
-    LOOPWRIGHT_WRITE_GOLDEN=1 python -m pytest tests/unit/service/cli/test_mistakes.py      writes the table again
+LOOPWRIGHT_WRITE_GOLDEN=1 python -m pytest tests/unit/service/cli/test_mistakes.py      writes the table again
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """docs/offline.md: what it shows of `rehearse` and `tune` is what these commands print.
 
-    LOOPWRIGHT_WRITE_GOLDEN=1 python -m pytest tests/unit/service/cli/test_offline_page.py      writes it again
+LOOPWRIGHT_WRITE_GOLDEN=1 python -m pytest tests/unit/service/cli/test_offline_page.py      writes it again
 """
 
 from __future__ import annotations

@@ -75,9 +75,7 @@ class WatchedLoop:
         self.n = 0
         self.ears = HeardAfter()
         gains = service.controller.state.gains
-        self.channel = Channel(
-            TS, Settings(), Parameters(gains.Kp, gains.Ti), self.plant.pv, int(Mode.AUTOMATIC), 50.0
-        )
+        self.channel = Channel(TS, Settings(), Parameters(gains.Kp, gains.Ti), self.plant.pv, int(Mode.AUTOMATIC), 50.0)
         self.channel.setpoint = 50.0
         self.pv = self.plant.pv
         self.gap = GAP_BEFORE

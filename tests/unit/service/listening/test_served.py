@@ -65,9 +65,7 @@ def test_a_loop_is_heard_read_and_kept_over_deaths(site: Site) -> None:
     until(lambda: gone(child))
     site.serve()
     # until the new one has heard something: what the old one heard while it ended is later than last_s too
-    found = site.until(
-        lambda found: found["at_s"] and any(gap["from_s"] >= last_s - 0.2 for gap in inner_gaps(found))
-    )
+    found = site.until(lambda found: found["at_s"] and any(gap["from_s"] >= last_s - 0.2 for gap in inner_gaps(found)))
     assert found["at_s"][0] <= last_s, "what was heard before is there"
     site.until(lambda found: found["gains"][-1] is not None)
 

@@ -92,9 +92,7 @@ UNKNOWN = "its device type is 00000002h, which is none of the profile"
         ([(0.1, VALUE[:7])], ["it answers no SDO"]),
     ],
 )
-def test_the_answers_to_a_request_are_told_from_others(
-    answers: list[tuple[float, bytes]], problems: list[str]
-) -> None:
+def test_the_answers_to_a_request_are_told_from_others(answers: list[tuple[float, bytes]], problems: list[str]) -> None:
     bus = AnsweringBus(answers)
     station = Station(monotonic=lambda: bus.now, open_bus=lambda url: bus)
     assert probe("wire", station, [0x33]) == [FoundNode(0x33, None, problems=tuple(problems))]
