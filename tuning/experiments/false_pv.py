@@ -67,6 +67,8 @@ LARGE_NOISES = 8.0
 QUIET_MORE, LARGE_MOVE = 15, 0.3
 """A PV that noise does not move has to answer a move of MV, of at least this part of MV's largest so far, within twice
 the rest's duration, which is no shorter than half of T95, and so many samples more."""
+QUANTA_SHOWN = 4.0
+"""A move of MV that moves PV by fewer quanta than that may be lost in its rounding."""
 STEADY_CHANGES, STEADY_SPEED, STOPPED_RUNS = 12, 0.4, 6
 """It has stopped in the middle of its way where its last changes, so many, went one way, the last no slower than this
 part of the fastest, and it is then equal for so many times the longest of their runs and QUIET_MORE samples. At a
@@ -211,7 +213,8 @@ class PvWatch:
         self._largest_of_mv = 0.0
         """The largest move of PV within a sample, beyond its noise, over MV's largest distance from home till then."""
         self._jump: _Jump | None = None
-        self._farthest_mv = 0.0
+        self._farthest_mv = self._farthest_pv = 0.0
+        self._least_change = math.inf
         self._moved_mv: tuple[float, int] = (mv, -1)
         """The last move of MV that PV has to answer: MV after it, and its sample."""
         self._answer_due: int | None = None
@@ -238,12 +241,22 @@ class PvWatch:
         self._check_jump(pv, mv)
         self._last = pv
 
+    def has_to_show(self, move: float) -> bool:
+        """Whether PV has to show a move of MV in spite of its quantum, as far as it has moved in the test so far.
+
+        move: MV units, positive. Of a PV that has not moved yet the answer is True.
+        """
+        if not self._changes or self._farthest_mv == 0.0:
+            return True
+        return move * self._farthest_pv > QUANTA_SHOWN * self._least_change * self._farthest_mv
+
     # equal values
 
     def _watch_mv(self, mv: float) -> None:
         """Notes moves of MV that are large beside those of the test."""
         self._farthest_mv = max(self._farthest_mv, abs(mv - self._mv_home))
-        if abs(mv - self._moved_mv[0]) > max(LARGE_MOVE * self._farthest_mv, self._hair):
+        move = abs(mv - self._moved_mv[0])
+        if move > max(LARGE_MOVE * self._farthest_mv, self._hair) and self.has_to_show(move):
             self._moved_mv = (mv, self._n)
             if self._answer_due is None:
                 self._answer_due = self._n
@@ -252,6 +265,8 @@ class PvWatch:
         if not math.isnan(self._last):
             self._longest_run = max(self._longest_run, self._run)
             self._changes.append((pv - self._last, self._run))
+            self._least_change = min(self._least_change, abs(pv - self._last))
+            self._farthest_pv = max(self._farthest_pv, abs(pv - self._rest.value))
         self._run, self._answer_due = 1, None
 
     def _check_run(self, pv: float, mv: float) -> None:

@@ -32,7 +32,8 @@ down."""
 GOES_ON_PART = 0.03
 """Part of the way by which PV has to go further, else it has come to rest: a load that came before the answer to MV."""
 ANSWERED_T95 = 1.5
-"""The answer to MV has begun by then, also where T95 is stated too short: a PV that is on the wrong side still, and has not turned, goes the wrong way."""
+"""The answer to MV has begun by then, also where T95 is stated too short: a PV that is on the wrong side still, and has
+not turned, goes the wrong way."""
 MIN_SAMPLES = 6
 LATER_DELAYS, LATER_HALVES = 2.0, 3.0
 """A later half wave begins on the wrong side. There PV may go on for the longer of so many times the delay of its first
