@@ -5,8 +5,12 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.false_sensor import FAST, MANUAL, METHODS, PROCEDURE, RULE_PLANTS, SETPOINT, Case, measured, true_sensor
+from benchmarks.false_sensor import METHODS, RULE_PLANTS, Case, measured, true_sensor
 from loopwright.plantsim.sensors import SensorFault
+from loopwright.tuning.fast.manual_procedure import MANUAL
+from loopwright.tuning.fast.procedure import FAST
+from loopwright.tuning.fast.setpoint_procedure import SETPOINT
+from loopwright.tuning.five_stage.procedure import PROCEDURE
 from loopwright.tuning.reasons import FalsePv
 
 ONE_LAG = RULE_PLANTS[0]

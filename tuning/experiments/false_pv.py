@@ -52,6 +52,8 @@ that of the distance from the median the second one, without the OUTLIERS farthe
 chance once in 1e5, whatever way PV moves."""
 OUTLIERS_BETWEEN, OUTLIERS = 4, 3
 LOUD_WINDOW = 15
+MOST_SELDOM = 4
+"""Number of samples from one value to the next from which on the way of PV may look like noise."""
 WHITE = 0.6
 """Smallest ratio of von Neumann of noise around a PV that stands still, without the two largest differences; it is far
 smaller where PV moves."""
@@ -72,7 +74,8 @@ QUANTA_SHOWN = 4.0
 STEADY_CHANGES, STEADY_SPEED, STOPPED_RUNS = 12, 0.4, 6
 """It has stopped in the middle of its way where its last changes, so many, went one way, the last no slower than this
 part of the fastest, and it is then equal for so many times the longest of their runs and QUIET_MORE samples. At a
-turning point it is equal for at most 4.8 times its last run, with a dead band 5.9 times."""
+turning point it is equal for at most 4.8 times its last run, with a dead band 5.9 times; where noise comes to a coarse
+quantum, for longer, and twice as long is waited for."""
 LONGEST_REST = 20_000
 """Largest number of samples at rest that are looked at."""
 
@@ -291,7 +294,8 @@ class PvWatch:
         if len(changes) < STEADY_CHANGES or self._run <= QUIET_MORE:
             return
         longest = max(run for _, run in changes)
-        if self._run <= STOPPED_RUNS * longest + QUIET_MORE:
+        coarse = abs(changes[-1][0]) <= QUANTA_SHOWN * self._least_change
+        if self._run <= (2 if coarse else 1) * STOPPED_RUNS * longest + QUIET_MORE:
             return
         sign = math.copysign(1.0, changes[-1][0])
         speeds = [sign * move / run for move, run in changes]
@@ -319,7 +323,7 @@ class PvWatch:
             variance = (squares[-1] - squares[-1 - window] - total * total / window) / (window - 1)
             if variance < least:
                 self._false_noise(pv, window, math.sqrt(max(variance, 0.0)))
-        if count >= LOUD_WINDOW and self._jump is None:
+        if count >= LOUD_WINDOW and self._jump is None and rest.renewal <= MOST_SELDOM:
             self._check_loud(pv)
 
     def _check_loud(self, pv: float) -> None:
