@@ -4,13 +4,13 @@ has gone by then; and how often a true one is taken for false.
 The rules were set on RULE_PLANTS, and are judged on JUDGED, which were written down before the first run and never
 looked at while a rule was set. A false sensor sends, from a moment on that is drawn within a phase: its last value,
 0.0, half its last value, half of what it should (`halved`), its last value with a quarter of its noise (`quiet`) or
-with four times of it (`loud`). The test has to end as FalsePv within 15 samples or Pu / 10, whichever is longer, and twice
-the longest run of equal values at rest; in that time and a dead time the true PV may go as far as the highest and the
-lowest MV of the test take it. A true sensor is rounded to 0.1 to 3 noises, renewed every 2 to 20 samples, without noise,
-on a fast plant, and under a stepped load.
+with four times of it (`loud`). The test has to end as FalsePv within 15 samples or Pu / 10, whichever is longer, and
+twice the longest run of equal values at rest; in that time and a dead time the true PV may go as far as the highest and
+the lowest MV of the test take it. A true sensor is rounded to 0.1 to 3 noises, renewed every 2 to 20 samples, without
+noise, on a fast plant, and under a stepped load.
 
     python -m benchmarks.false_sensor
-    python -m benchmarks.false_sensor --true 100 --moments 1 --plants rule
+    python -m benchmarks.false_sensor --true 100 --whole --moments 1 --plants rule
 """
 
 from __future__ import annotations
@@ -36,21 +36,23 @@ from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.tuning.analysis.margins import ultimate_point
-from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE
-from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE, at_rest
+from loopwright.tuning.experiments.primitives import Facts, record
 from loopwright.tuning.fast.manual_procedure import MANUAL, by_manual
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.procedure import FAST, FastOptions, fast
+from loopwright.tuning.fast.relay_test import RelayTest
 from loopwright.tuning.fast.setpoint_procedure import SETPOINT, setpoint
 from loopwright.tuning.five_stage.procedure import PROCEDURE, Options, five_stage
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
-from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, StageStarted
+from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, SetMode, SetOutput, SetSetpoint, StageStarted
 from loopwright.tuning.reasons import Ended, FalsePv
 
 SP, MV = 60.0, 40.0
 """Where every loop is at rest."""
 METHODS = (FAST, SETPOINT, PROCEDURE, MANUAL)
+MOVES = "moves"
 RUN_OF_REST, SAMPLES, PART_OF_PERIOD = 2, 15, 10.0
 """The time in which a test has to end."""
 
@@ -172,6 +174,7 @@ def tested(
         SETPOINT: lambda: setpoint(facts, DesignOptions(propose_anyway=True)),
         PROCEDURE: lambda: five_stage(facts, Options(propose_anyway=True)),
         MANUAL: lambda: by_manual(facts, DesignOptions(propose_anyway=True), MANUAL),
+        MOVES: lambda: moves(facts, Gains(0.3 * Ku, 0.6 * Pu), Pu),
     }
     noise = seen.noise * process.noise
     plant = SensedPlant(process.plant(), noise, seen.quantum * process.noise, seen.renewal, seed)
@@ -272,11 +275,32 @@ def _beyond(process: Process, loop: Tested, at: int, allowed: float) -> float:
     return max(0.0, max(true) - max(ways) - 1e-9, min(ways) - min(true) - 1e-9)
 
 
-def true_sensor(seed: int) -> tuple[str, Ended | None]:
-    """A run with a true sensor, drawn; what it was, and how it ended."""
+def moves(facts: Facts, gains: Gains, period_s: float) -> Plan[object]:
+    """What the procedures move on a loop, without their computations: the relay, set-point steps under gains on trial,
+    pulses of the set-point and of the manual output."""
+    point, listened = yield from at_rest(facts, 0.0)
+    test = RelayTest(facts, point, listened, None)
+    yield from test.relay(8)
+    yield from test.step(gains, period_s)
+    yield from test.step_back()
+    span = 0.4 * facts.T95_s + period_s
+    for part in (1.0, -1.0, 1.0, 0.0):
+        yield from record(span, (SetSetpoint(point.sp + part * facts.sp_deviation),))
+    yield from record(span, (SetMode(Mode.MANUAL), SetOutput(point.mv)))
+    for part in (1.0, -1.0, 0.5):
+        yield from record(0.3 * span, (SetOutput(point.mv + 0.5 * part * point.room),))
+        yield from record(span, (SetOutput(point.mv),))
+    return None
+
+
+def true_sensor(seed: int, quick: bool = True) -> tuple[str, Ended | None]:
+    """A run with a true sensor, drawn; what it was, and how it ended.
+
+    quick: of the moves of the procedures, or of five-stage, rather than of any procedure with its computations.
+    """
     rng = random.Random(f"true {seed}")
     process = drawn_process(rng)
-    method = rng.choices(METHODS, (2, 1, 6, 1))[0]  # by how long their computations take
+    method = rng.choice((MOVES, MOVES, MOVES, PROCEDURE)) if quick else rng.choice(METHODS)
     kind = rng.choice(("rounded", "renewed", "both", "no noise", "no noise, rounded", "loaded", "loaded"))
     seen = {
         "rounded": Seen(quantum=rng.uniform(0.1, 3.0)),
@@ -339,15 +363,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--moments", type=int, default=2, help="of each phase, for each fault (default: 2)")
     parser.add_argument("--true", type=int, default=1000, help="runs with a true sensor (default: 1000)")
     parser.add_argument("--first", type=int, default=1, help="the seed of the first of them (default: 1)")
+    parser.add_argument("--whole", action="store_true", help="these with whole procedures, which compute for seconds")
     parser.add_argument("--methods", nargs="*", default=METHODS, choices=METHODS)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--show", action="store_true", help="each run that is not as it should be")
     given = parser.parse_args(argv)
     processes = RULE_PLANTS if given.plants == "rule" else JUDGED
     found = [measured(case) for case in cases(processes, given.methods, given.moments, given.seed)]
-    alarms = []
+    alarms, ends = [], Counter[str]()
     for seed in range(given.first, given.first + given.true):
-        words, ended = true_sensor(seed)
+        words, ended = true_sensor(seed, not given.whole)
+        ends[ended.reason.value if ended else "through"] += 1
         if isinstance(ended, FalsePv):
             alarms.append(f"{words}: {ended}")
     if given.show:
@@ -356,7 +382,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 print(each, file=sys.stderr)
         for alarm in alarms:
             print(alarm, file=sys.stderr)
-    answer = {"false": figures(found), "true": {"runs": given.true, "alarms": len(alarms)}}
+    answer = {"false": figures(found), "true": {"runs": given.true, "alarms": len(alarms), "ended": dict(ends)}}
     print(json.dumps(answer, indent=1))
     return 0
 

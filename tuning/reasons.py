@@ -139,7 +139,7 @@ ADVICE: dict[Reason, str] = {
     "Where the loop was put in manual for it, control it by hand; when PV is right again, sign the alarm off (or "
     "loopwright dismiss TAG), put the loop in automatic, then retune.",
     Reason.SAMPLES_LOST: "Samples were lost on the way: check bus load, or run a simulated plant more slowly.",
-    Reason.PV_FROZEN: "PV stood still as the plant cannot: check the sensor. A loop that was in automatic was put in "
+    Reason.PV_FROZEN: "PV stood still, or had another noise, as the plant cannot: check the sensor. A loop that was in automatic was put in "
     "manual for it: control it by hand; when PV is right again, sign the alarm off (or loopwright dismiss TAG), put "
     "the loop in automatic, then retune.",
     Reason.SETPOINT_CHANGED: "Somebody else moved the set-point during the test; agree on the time and repeat.",

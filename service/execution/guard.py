@@ -91,7 +91,7 @@ class Guard:
             self._watch.check(pv, mv)
         if pv != self._pv:
             self._frozen_at, self._pv, self._mv = t, pv, mv
-        elif abs(mv - self._mv) < self._notable:
+        elif (move := abs(mv - self._mv)) < self._notable or not (self._watch is None or self._watch.has_to_show(move)):
             self._frozen_at = t
         elif t - self._frozen_at > self._limits.max_frozen_s:
             raise FalsePv(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {t - self._frozen_at:.3g} s while MV moved")

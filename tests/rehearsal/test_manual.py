@@ -99,7 +99,7 @@ def test_an_unstable_plant_is_refused_after_the_first_pulse() -> None:
     assert taken[-1].mv == 0.0
 
 
-def test_a_plant_that_does_not_answer_is_refused_after_larger_pulses() -> None:
+def test_a_plant_that_does_not_answer_is_refused() -> None:
     plant = under("first order", 0.001, noise_std=0.05, num=[1e-4], sp_deviation=1.0)
     answer, taken = pulsed(plant)
     assert (answer["outcome"], answer["reason"]) == ("refused", "no_response")

@@ -52,6 +52,8 @@ that of the distance from the median the second one, without the OUTLIERS farthe
 chance once in 1e5, whatever way PV moves."""
 OUTLIERS_BETWEEN, OUTLIERS = 4, 3
 LOUD_WINDOW = 15
+MOST_SELDOM = 4
+"""Number of samples from one value to the next from which on the way of PV may look like noise."""
 WHITE = 0.6
 """Smallest ratio of von Neumann of noise around a PV that stands still, without the two largest differences; it is far
 smaller where PV moves."""
@@ -59,15 +61,21 @@ JUMP_NOISES, JUMP_MOVES = 100.0, 20.0
 """A jump is at least so many noises, and so many times the largest move within a sample so far."""
 JUMP_STAYS, JUMP_BAND = 6, 0.25
 """PV has to stay for so many samples within this part of the jump."""
-ANSWERED_NOISES = 10.0
-"""Distance from rest, in noises, from which PV has answered MV."""
+ANSWERED_NOISES, FAR_MORE = 10.0, 3.0
+"""Distance from rest, in noises, from which PV has answered MV. The first answer to moves of MV that are so many times
+larger than any that it has answered may be as fast as a jump."""
+LARGE_NOISES = 8.0
+"""Move of PV within a sample, in noises, that is none of its noise."""
 QUIET_MORE, LARGE_MOVE = 15, 0.3
 """A PV that noise does not move has to answer a move of MV, of at least this part of MV's largest so far, within twice
 the rest's duration, which is no shorter than half of T95, and so many samples more."""
+QUANTA_SHOWN = 4.0
+"""A move of MV that moves PV by fewer quanta than that may be lost in its rounding."""
 STEADY_CHANGES, STEADY_SPEED, STOPPED_RUNS = 12, 0.4, 6
 """It has stopped in the middle of its way where its last changes, so many, went one way, the last no slower than this
 part of the fastest, and it is then equal for so many times the longest of their runs and QUIET_MORE samples. At a
-turning point it is equal for at most 4.8 times its last run, with a dead band 5.9 times."""
+turning point it is equal for at most 4.8 times its last run, with a dead band 5.9 times; where noise comes to a coarse
+quantum, for longer, and twice as long is waited for."""
 LONGEST_REST = 20_000
 """Largest number of samples at rest that are looked at."""
 
@@ -202,10 +210,14 @@ class PvWatch:
         self._run = 1
         self._longest_run = 0
         """The longest run since the first move of MV that PV has ended."""
-        self._answered = False
+        self._answered = 0.0
+        """MV's largest distance from home when PV was last away from rest: to so much it has answered."""
         self._largest = rest.largest_move
+        self._largest_of_mv = 0.0
+        """The largest move of PV within a sample, beyond its noise, over MV's largest distance from home till then."""
         self._jump: _Jump | None = None
-        self._farthest_mv = 0.0
+        self._farthest_mv = self._farthest_pv = 0.0
+        self._least_change = math.inf
         self._moved_mv: tuple[float, int] = (mv, -1)
         """The last move of MV that PV has to answer: MV after it, and its sample."""
         self._answer_due: int | None = None
@@ -232,12 +244,22 @@ class PvWatch:
         self._check_jump(pv, mv)
         self._last = pv
 
+    def has_to_show(self, move: float) -> bool:
+        """Whether PV has to show a move of MV in spite of its quantum, as far as it has moved in the test so far.
+
+        move: MV units, positive. Of a PV that has not moved yet the answer is True.
+        """
+        if not self._changes or self._farthest_mv == 0.0:
+            return True
+        return move * self._farthest_pv > QUANTA_SHOWN * self._least_change * self._farthest_mv
+
     # equal values
 
     def _watch_mv(self, mv: float) -> None:
         """Notes moves of MV that are large beside those of the test."""
         self._farthest_mv = max(self._farthest_mv, abs(mv - self._mv_home))
-        if abs(mv - self._moved_mv[0]) > max(LARGE_MOVE * self._farthest_mv, self._hair):
+        move = abs(mv - self._moved_mv[0])
+        if move > max(LARGE_MOVE * self._farthest_mv, self._hair) and self.has_to_show(move):
             self._moved_mv = (mv, self._n)
             if self._answer_due is None:
                 self._answer_due = self._n
@@ -246,6 +268,8 @@ class PvWatch:
         if not math.isnan(self._last):
             self._longest_run = max(self._longest_run, self._run)
             self._changes.append((pv - self._last, self._run))
+            self._least_change = min(self._least_change, abs(pv - self._last))
+            self._farthest_pv = max(self._farthest_pv, abs(pv - self._rest.value))
         self._run, self._answer_due = 1, None
 
     def _check_run(self, pv: float, mv: float) -> None:
@@ -270,7 +294,8 @@ class PvWatch:
         if len(changes) < STEADY_CHANGES or self._run <= QUIET_MORE:
             return
         longest = max(run for _, run in changes)
-        if self._run <= STOPPED_RUNS * longest + QUIET_MORE:
+        coarse = abs(changes[-1][0]) <= QUANTA_SHOWN * self._least_change
+        if self._run <= (2 if coarse else 1) * STOPPED_RUNS * longest + QUIET_MORE:
             return
         sign = math.copysign(1.0, changes[-1][0])
         speeds = [sign * move / run for move, run in changes]
@@ -298,7 +323,7 @@ class PvWatch:
             variance = (squares[-1] - squares[-1 - window] - total * total / window) / (window - 1)
             if variance < least:
                 self._false_noise(pv, window, math.sqrt(max(variance, 0.0)))
-        if count >= LOUD_WINDOW and self._jump is None:
+        if count >= LOUD_WINDOW and self._jump is None and rest.renewal <= MOST_SELDOM:
             self._check_loud(pv)
 
     def _check_loud(self, pv: float) -> None:
@@ -341,15 +366,22 @@ class PvWatch:
             return
         move = pv - self._last
         known = rest.lively or len(self._changes) == STEADY_CHANGES
-        if known and abs(move) > max(JUMP_NOISES * rest.noise, JUMP_MOVES * self._largest) > 0.0:
-            first = not self._answered and move * self._direction * (mv - self._mv_home) > 0.0
-            seldom = not self._answered and rest.renewal > 1
-            if not first and not seldom:
-                self._jump = _Jump(self._last, pv, self._largest)
+        largest = max(self._largest, self._largest_of_mv * self._farthest_mv)
+        if known and abs(move) > max(JUMP_NOISES * rest.noise, JUMP_MOVES * largest) > 0.0:
+            unknown = self._farthest_mv > FAR_MORE * self._answered
+            expected = move * self._direction * (mv - self._mv_home) > 0.0
+            if not (unknown and (expected or rest.renewal > 1)):
+                self._jump = _Jump(self._last, pv, largest)
                 return
         if abs(pv - rest.value) > ANSWERED_NOISES * rest.noise:
-            self._answered = True
-        self._largest = max(self._largest, abs(move))
+            self._answered = self._farthest_mv
+        self._moved(abs(move))
+
+    def _moved(self, move: float) -> None:
+        """Learns what a true PV moves by within a sample."""
+        self._largest = max(self._largest, move)
+        if move > LARGE_NOISES * self._rest.noise and self._farthest_mv > 0.0:
+            self._largest_of_mv = max(self._largest_of_mv, move / self._farthest_mv)
 
     def _go_on_with_jump(self, jump: _Jump, pv: float) -> None:
         rest = self._rest
@@ -357,14 +389,14 @@ class PvWatch:
         size = jump.to - jump.before
         if abs(pv - jump.to) > JUMP_BAND * abs(size):
             if abs(pv - jump.before) > JUMP_BAND * abs(size):
-                self._largest = max(self._largest, abs(size))  # it goes on: a fast plant
+                self._moved(abs(size))  # it goes on: a fast plant
             self._jump = None
             return
         ways = 2 * rest.renewal
         if jump.since == ways:
             further = math.copysign(1.0, size) * (pv - jump.to)
             if further > ways * jump.largest_move + 5.0 * rest.noise:
-                self._largest = max(self._largest, abs(size))
+                self._moved(abs(size))
                 self._jump = None
                 return
         if jump.since >= max(JUMP_STAYS, ways + 1) - 1:

@@ -29,6 +29,11 @@ FAR_STEPS = 3.0
 SLOWED = 0.8
 """Speed of PV in the second half of the time since it left its band, over that in the first half, below which it slows
 down."""
+GOES_ON_PART = 0.03
+"""Part of the way by which PV has to go further, else it has come to rest: a load that came before the answer to MV."""
+ANSWERED_T95 = 1.5
+"""The answer to MV has begun by then, also where T95 is stated too short: a PV that is on the wrong side still, and has
+not turned, goes the wrong way."""
 MIN_SAMPLES = 6
 LATER_DELAYS, LATER_HALVES = 2.0, 3.0
 """A later half wave begins on the wrong side. There PV may go on for the longer of so many times the delay of its first
@@ -106,7 +111,7 @@ class HalfWaves:
         return Refused(
             Reason.WRONG_SIGN,
             f"PV went the wrong way: {len(self._away) * Ts:.3g} s after it left its band it is {self._farthest:.4g} "
-            f"away, and goes on; the relay began {self._samples * Ts:.4g} s ago",
+            f"away, and has not turned; the relay began {self._samples * Ts:.4g} s ago",
         )
 
     def _turned(self) -> float:
@@ -120,6 +125,8 @@ class HalfWaves:
             return away > longest and self._goes_on(away)
         if away < max(self._delay, MIN_SAMPLES):
             return False
+        if self._samples > ANSWERED_T95 * facts.T95_s / facts.sample_time_s:
+            return True
         if away > inverse:
             return self._goes_on(away)
         step = facts.sp_deviation
@@ -127,10 +134,15 @@ class HalfWaves:
         return (deep or self._farthest > FAR_STEPS * step) and not self._slows_down(away)
 
     def _goes_on(self, away: int) -> bool:
-        """Whether PV has gone further in the last quarter of the time."""
-        return self._farthest > max(self._away[: away - away // 4])
+        """Whether PV has gone further in the last quarter of the time than its noise alone makes it seem."""
+        quarter = max(away // 4, 1)
+        last, before = (sum(part) / quarter for part in (self._away[-quarter:], self._away[-2 * quarter : -quarter]))
+        return last - before > self._least()
 
     def _slows_down(self, away: int) -> bool:
         half = away // 2
         first, second = self._away[half] - self._away[0], self._away[-1] - self._away[half]
-        return second < SLOWED * first
+        return second < max(SLOWED * first, self._least())
+
+    def _least(self) -> float:
+        return max(2.0 * self._noise, GOES_ON_PART * self._farthest)

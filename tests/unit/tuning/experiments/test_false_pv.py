@@ -114,7 +114,7 @@ def test_a_pv_without_noise_that_stops_in_the_middle_of_its_way_is_false() -> No
     pv = [float(value) for value in AT + np.concatenate([np.zeros(REST), way])]
     false = seen(pv)
     assert false is not None and false.reason is Reason.PV_FROZEN
-    assert told_at(false) < 30 + 25
+    assert told_at(false) < 30 + 30
     watch = PvWatch(PvAtRest.of([AT] * REST), 40.0, 1.0, 0.0, 100.0)
     for n in range(400):
         watch.check(AT + 3.0 - 3.0 * 0.8**n, 60.0)  # a lag comes to rest slowly
