@@ -76,7 +76,8 @@ class Reason(StrEnum):
 
 
 ADVICE: dict[Reason, str] = {
-    Reason.NOT_AT_REST: "Wait until PV and MV are steady (or put the loop in manual and let it settle), then retune.",
+    Reason.NOT_AT_REST: "Wait until PV and MV are steady (or put the loop in manual and let it settle), then retune. "
+    "A loop that cycles because its valve sticks does not settle: see to the valve first.",
     Reason.NOISE_TOO_HIGH: "Filter the measurement or permit a larger set-point deviation.",
     Reason.SATURATED: "MV is at a limit: move the operating point or widen the limits, then retune.",
     Reason.WRONG_MODE: "Put the loop in automatic with working gains, or permit pulses of the manual output "
@@ -107,8 +108,9 @@ ADVICE: dict[Reason, str] = {
     Reason.MV_LIMIT: "MV reached its limit during the test: permit more MV or a smaller set-point deviation.",
     Reason.STALLED: "The test did not go on: a load about as large as what the test moves holds PV. Wait until it is "
     "over, or permit more MV.",
-    Reason.UNEXPLAINED: "No linear model explains the record: look for a sticking valve, a limit, a gain that changes "
-    "with MV (linearise the valve's characteristic, or permit less MV), another loop or several changes of the load, "
+    Reason.UNEXPLAINED: "No linear model explains the record: look for a sticking valve, a limit, lags that "
+    "differ for rising and falling, a gain that changes with MV (linearise the valve's characteristic, or permit less "
+    "MV), another loop or several changes of the load, "
     "then retune.",
     Reason.DISTURBED: "Something slow moved PV during the test: wait for a steady time, then retune.",
     Reason.UNCERTAIN: "The record does not tell enough for this robustness: permit more MV, filter the measurement, or "
