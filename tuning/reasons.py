@@ -79,7 +79,8 @@ class Reason(StrEnum):
 
 
 ADVICE: dict[Reason, str] = {
-    Reason.NOT_AT_REST: "Wait until PV and MV are steady (or put the loop in manual and let it settle), then retune.",
+    Reason.NOT_AT_REST: "Wait until PV and MV are steady (or put the loop in manual and let it settle), then retune. "
+    "A loop that cycles because its valve sticks does not settle: see to the valve first.",
     Reason.NOISE_TOO_HIGH: "Filter the measurement or permit a larger set-point deviation.",
     Reason.SATURATED: "MV is at a limit: move the operating point or widen the limits, then retune.",
     Reason.WRONG_MODE: "Put the loop in automatic with working gains, or permit pulses of the manual output "
@@ -110,8 +111,9 @@ ADVICE: dict[Reason, str] = {
     Reason.MV_LIMIT: "MV reached its limit during the test: permit more MV or a smaller set-point deviation.",
     Reason.STALLED: "The test did not go on: a load about as large as what the test moves holds PV. Wait until it is "
     "over, or permit more MV.",
-    Reason.UNEXPLAINED: "No linear model explains the record: look for a sticking valve, a limit, a gain that changes "
-    "with MV (linearise the valve's characteristic, or permit less MV), another loop or several changes of the load, "
+    Reason.UNEXPLAINED: "No linear model explains the record: look for a sticking valve, a limit, lags that "
+    "differ for rising and falling, a gain that changes with MV (linearise the valve's characteristic, or permit less "
+    "MV), another loop or several changes of the load, "
     "then retune.",
     Reason.PV_ALTERED: "PV reaches the controller otherwise than the plant gives it: have the sensor, or what passes "
     "its value on, renew it at every sample, finely and without wrong samples, or choose a sample time as long as its "
@@ -139,9 +141,9 @@ ADVICE: dict[Reason, str] = {
     "Where the loop was put in manual for it, control it by hand; when PV is right again, sign the alarm off (or "
     "loopwright dismiss TAG), put the loop in automatic, then retune.",
     Reason.SAMPLES_LOST: "Samples were lost on the way: check bus load, or run a simulated plant more slowly.",
-    Reason.PV_FROZEN: "PV stood still, or had another noise, as the plant cannot: check the sensor. A loop that was in automatic was put in "
-    "manual for it: control it by hand; when PV is right again, sign the alarm off (or loopwright dismiss TAG), put "
-    "the loop in automatic, then retune.",
+    Reason.PV_FROZEN: "PV stood still, or had another noise, as the plant cannot: check the sensor. A loop that was in "
+    "automatic was put in manual for it: control it by hand; when PV is right again, sign the alarm off (or loopwright "
+    "dismiss TAG), put the loop in automatic, then retune.",
     Reason.SETPOINT_CHANGED: "Somebody else moved the set-point during the test; agree on the time and repeat.",
     Reason.MODE_CHANGED: "Somebody else changed the mode during the test; agree on the time and repeat.",
     Reason.GAINS_CHANGED: "Somebody else tried other gains during the test; agree on the time and repeat.",

@@ -101,6 +101,7 @@ class BusConnection:
             if node is not None and states.get(node) == NmtState.STOPPED:
                 return not_operational(node, NmtState.STOPPED)
         if self._tuner is not None and self._tuner.beats(error.node):
-            text = f"{error}, and beats: its heartbeat is heard ({state_name(states.get(error.node, NmtState.OPERATIONAL))})"
+            state = state_name(states.get(error.node, NmtState.OPERATIONAL))
+            text = f"{error}, and beats: its heartbeat is heard ({state})"
             return Failed(Reason.NODE_NOT_ANSWERING, text)
         return Failed(Reason.NODE_LOST, str(error))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopwright.service.offline.csv_record.record import Record
+from loopwright.tuning.analysis.sticking import find_sticking
 from loopwright.tuning.identification.identify import SURELY_WHITE, Identified
 from loopwright.tuning.identification.problem import NEGLIGIBLE_RMS
 from loopwright.tuning.identification.record import sample_time
@@ -79,7 +80,9 @@ def _why(record: Record, found: InAutomatic) -> str:
         return "MV has many values, as the output of a controller has"
     if not control.setpoint_moves:
         rests = record.without_setpoint if record.sp is None else "SP rests"
-        return f"MV follows PV, as in automatic, and {rests}"
+        text = f"MV follows PV, as in automatic, and {rests}"
+        sticking = find_sticking(sample_time(record.t), np.asarray(record.u), np.asarray(record.y))
+        return text if sticking is None else f"{text}; {sticking.in_words}"
     times = "once" if control.setpoint_moves == 1 else f"{control.setpoint_moves} times"
     if found.law:
         follows = f"MV follows SP and PV{found.law} ({100.0 * control.part:.4g} % of its moves)"

@@ -7,14 +7,16 @@ and checked again.
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
 from loopwright.tuning.analysis.pv_faults import pv_faults, without_wrong_samples
+from loopwright.tuning.analysis.sticking import find_sticking
 from loopwright.tuning.analysis.window import swing_at_rest
 from loopwright.tuning.experiments.controller_mismatch import check_law_at_rest
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, record
-from loopwright.tuning.plan import Mode, Note, Plan, StageStarted
+from loopwright.tuning.plan import Mode, Note, Plan, StageStarted, worked
 from loopwright.tuning.reasons import Reason, Refused
 
 PREFLIGHT, SETTLE = "preflight", "settle"
@@ -53,25 +55,40 @@ def at_rest(
     """
     once_s = facts.T95_s / 2
     begin = (StageStarted(PREFLIGHT, once_s, after_s),)
+    heard = Trace()
     for _ in range(MAX_ATTEMPTS - 1):
         yield begin
         try:
-            return (yield from check_at_rest(facts, min_samples, mode))
+            return (yield from check_at_rest(facts, min_samples, mode, heard))
         except Refused as refused:
             if refused.reason is not Reason.NOT_AT_REST:
                 raise
-            yield from record(once_s, (Note(refused.detail), StageStarted(SETTLE, once_s, once_s + after_s)))
+            note = Note(refused.detail), StageStarted(SETTLE, once_s, once_s + after_s)
+            heard.extend((yield from record(once_s, note)))
     yield begin
-    return (yield from check_at_rest(facts, min_samples, mode))
+    try:
+        return (yield from check_at_rest(facts, min_samples, mode, heard))
+    except Refused as refused:
+        if refused.reason is not Reason.NOT_AT_REST or mode is not Mode.AUTOMATIC:
+            raise
+        cause = yield from worked(partial(find_sticking, facts.sample_time_s, *map(np.asarray, (heard.mv, heard.pv))))
+        if cause is None:
+            raise
+        raise Refused(Reason.NOT_AT_REST, f"{refused.detail}; {cause.in_words}") from None
 
 
 def check_at_rest(
-    facts: Facts, min_samples: int = MIN_LISTENED_SAMPLES, mode: Mode = Mode.AUTOMATIC
+    facts: Facts, min_samples: int = MIN_LISTENED_SAMPLES, mode: Mode = Mode.AUTOMATIC, heard: Trace | None = None
 ) -> Plan[tuple[OperatingPoint, Trace]]:
-    """Checks the loop once, for half of T95 and at least `min_samples`. Raises Refused as `at_rest`."""
+    """Checks the loop once, for half of T95 and at least `min_samples`. Raises Refused as `at_rest`.
+
+    heard: gets the samples as well.
+    """
     trace = yield from record(max(facts.T95_s / 2, min_samples * facts.sample_time_s))
     sample = yield ()
     trace.add(sample)
+    if heard is not None:
+        heard.extend(trace)
     if sample.mode != mode:
         found = Mode(sample.mode).name.lower()
         raise Refused(Reason.WRONG_MODE, f"the controller is in mode {found}, not {mode.name.lower()}")

@@ -129,9 +129,9 @@ def what_moved(t_s: Array, mv: Array, pv: Array, T95_s: float, noise: float) -> 
 
 @dataclass(frozen=True, slots=True)
 class _Explanation:
-    """left: the sum of squares that it leaves. gain: of the plant. answer: the largest move of PV by MV. size: of the disturbance, a load in PV or a drift;
-    0 is none of either. T: the lag, s; infinite of an integrating plant. delay, at: the dead time and the time of the
-    disturbance, in averages."""
+    """left: the sum of squares that it leaves. gain: of the plant; 0 is none. answer: the largest move of PV by MV.
+    size: of the disturbance, a load in PV or a drift; 0 is none. T: the lag, s; infinite of an integrating plant.
+    delay, at: the dead time and the time of the disturbance, in averages."""
 
     left: float
     gain: float

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from loopwright.tuning.analysis.notebook import as_html
 from loopwright.tuning.analysis.pv_faults import pv_faults, without_wrong_samples
+from loopwright.tuning.analysis.sticking import find_sticking
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN, by_bic
 from loopwright.tuning.identification.feedback_test import follows_from_pv
 from loopwright.tuning.identification.output_error import NOT_AT_REST_INITIALLY, UNDISTURBED, Fitted, count
@@ -204,6 +205,8 @@ def identify(
         found = replace(found, notes=(f"{wrong}: they were left out.", *found.notes))
     if not lags_only and follows_from_pv(record.u, record.y):
         found = replace(found, explained=False, notes=(FEEDBACK, *found.notes))
+    if not found.explained and (sticking := find_sticking(record.Ts, record.u, record.y)) is not None:
+        found = replace(found, notes=(f"As if it had been in automatic, {sticking.in_words}.", *found.notes))
     return found
 
 
