@@ -39,6 +39,8 @@ OTHER_CHANGES = {"above rest": above_rest, "squared": squared, "cubed": cubed}
 """What else may explain a record, and is not named here."""
 APART = {"steps": 3, "window": 4}
 """How many of its neighbours in the list of sizes are left out beside one that is fitted."""
+LEFT = 0.05
+"""Smallest part of MV's largest move that a fault leaves."""
 BEGUN = 3
 """How many sizes of a kind that is named are refined."""
 CLEAR = 4.0
@@ -90,7 +92,7 @@ def find_mv_fault(fit: Fit[ExperimentRecord], best: Fitted, mv_at_rest: float) -
     tests = ScoreTests(fit, best)
     likeliest: dict[str, tuple[Fitted, _Tried]] = {}
     for kind in _kinds(record, mv_at_rest):
-        tried = list(kind)
+        tried = [each for each in kind if _moves(each, record)]
         if not tried:
             continue
         shares, deviations = tests.scores(np.array([each.u for each in tried]) - record.u)
@@ -153,7 +155,7 @@ def _refined(record: ExperimentRecord, mv_at_rest: float, some: Sequence[_Tried]
         for _ in range(REFINED):
             before = fault
             for each in _near(record, mv_at_rest, fault, finer):
-                again = fitted(each)
+                again = fitted(each) if _moves(each, record) else found
                 if again.bic < found.bic:
                     found, fault = again, each
                     thetas[SECOND] = found.theta
@@ -163,6 +165,11 @@ def _refined(record: ExperimentRecord, mv_at_rest: float, some: Sequence[_Tried]
     found, fault = min(ended, key=lambda each: each[0].bic)
     last = fitted(fault, STRUCTURES)
     return (last if last.bic < found.bic else found), fault
+
+
+def _moves(tried: _Tried, record: ExperimentRecord) -> bool:
+    """Whether the fault leaves something of MV's moves."""
+    return float(np.max(np.abs(tried.u))) > LEFT * record.input_range
 
 
 def _distinct(ranked: Sequence[int], apart: int) -> list[int]:
