@@ -89,14 +89,16 @@ def find_mv_fault(fit: Fit[ExperimentRecord], best: Fitted, mv_at_rest: float) -
     record = fit.record
     if len(record.pieces) > 1:
         return None
-    tests = ScoreTests(fit, best)
+    # a structure that jumps with MV, or a poor minimum, may not know a fault that another one shows
+    of = [ScoreTests(fit, each) for each in (best, *fit_structures(fit, UNDISTURBED, structures=(SECOND,)))]
     likeliest: dict[str, tuple[Fitted, _Tried]] = {}
     for kind in _kinds(record, mv_at_rest):
         tried = [each for each in kind if _moves(each, record)]
         if not tried:
             continue
-        shares, deviations = tests.scores(np.array([each.u for each in tried]) - record.u)
-        decrease = np.where(np.isfinite(deviations), (2.0 * shares - 1.0) / np.square(deviations), 0.0)
+        changed = np.array([each.u for each in tried]) - record.u
+        scored = (tests.scores(changed) for tests in of)
+        decrease = np.max([(2.0 * shares - 1.0) / np.square(deviations) for shares, deviations in scored], axis=0)
         ranked = np.argsort(-decrease).tolist()
         if not decrease[ranked[0]] > CLEAR:
             continue
