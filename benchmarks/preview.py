@@ -12,11 +12,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
 
+from benchmarks.command import parser_of, show
 from benchmarks.controllers import T95_PERIODS
+from benchmarks.drawn_runs import kept, saved
 from benchmarks.operation import PRESENT, present_gains
 from benchmarks.plants import Plant
 from benchmarks.random_plants import random_plant
@@ -28,7 +33,7 @@ from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.procedures import plan
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.result import result_of
-from loopwright.service.execution.runner import run
+from loopwright.service.execution.runner import run as run_plan
 from loopwright.service.inputs.config import Limits, LoopConfig, PermittedTest
 from loopwright.service.inputs.request import RetuneRequest, retune_request, within
 from loopwright.service.planning.expected import LoopModel
@@ -140,7 +145,7 @@ def tested(of: Drawn, request: RetuneRequest, loop: RehearsedLoop) -> tuple[Hear
     loop.__class__, loop.heard = StagedLoop, heard  # type: ignore[attr-defined]
     procedure = plan(config, request, facts, mode=state.mode)
     limits = RunLimits(config.pv_limits.low, config.pv_limits.high, 0.0, 100.0, max_time_s=500.0 * config.t95_s)
-    return heard, run(procedure, loop, limits=limits, on_event=heard.event)
+    return heard, run_plan(procedure, loop, limits=limits, on_event=heard.event)
 
 
 def known(of: Drawn, by: str) -> LoopModel:
@@ -174,3 +179,35 @@ def measured(number: int) -> list[Said]:
         reason = "" if ran.ended is None else ran.ended.reason.value
         found.append(Said(of.plant.name, way, model.source, bound, heard.went, reason))
     return found
+
+
+def run(plants: int = PLANTS, first: int = FIRST, file: Path | None = None) -> dict[str, Any]:
+    """The figures, in all and of each way to move the loop."""
+    found = saved(Said, file)
+    done = {each.plant for each in found}
+    for number in range(first, first + plants):
+        if random_plant(number).name not in done:
+            found += [kept(each, file) for each in measured(number)]
+    runs = [each for each in found if each.bound[""] > 0.0 and each.went[""] > 0.0]
+    ways = {way: _figures([each for each in runs if each.way == way]) for way in WAYS}
+    return {"plants": plants, **_figures(runs), "ways": ways}
+
+
+def _figures(runs: Sequence[Said]) -> dict[str, Any]:
+    times = sorted(each.bound[""] / each.went[""] for each in runs)
+    return {
+        "runs": len(times),
+        "beyond": sum(each < 1.0 for each in times),
+        "most_beyond": max(0.0, 1.0 / times[0] - 1.0) if times else None,
+        "times_median": median(times) if times else None,
+        "times_p90": times[int(0.9 * len(times))] if times else None,
+    }
+
+
+if __name__ == "__main__":
+    parser = parser_of(__doc__)
+    parser.add_argument("--plants", type=int, default=PLANTS, help="how many (default: %(default)s)")
+    parser.add_argument("--first", type=int, default=FIRST, help="the number of the first (default: %(default)s)")
+    parser.add_argument("--save", type=Path, help="a file of runs to go on from, and to add to")
+    given = parser.parse_args()
+    show(partial(run, given.plants, given.first, given.save))

@@ -341,6 +341,23 @@ def of_page(page: Figures) -> list[str]:
     ]
 
 
+def of_preview(found: Figures) -> list[str]:
+    return [
+        row(
+            f"preview with a model, {found['plants']} plants, {found['runs']} undisturbed retunes: PV beyond the bound",
+            f"{found['beyond']} runs, by {100 * found['most_beyond']:.0f} % of it at most",
+            "5 % of the runs, by 10 %",
+            found["beyond"] <= 0.05 * found["runs"] and found["most_beyond"] <= 0.1,
+        ),
+        row(
+            "the same, the bound over how far PV went",
+            f"{found['times_median']:.2f} (median), {found['times_p90']:.2f} (p90)",
+            "1.5 times at the median",
+            found["times_median"] <= 1.5,
+        ),
+    ]
+
+
 ROWS: dict[str, Callable[[Figures], list[str]]] = {
     "bus": of_bus,
     "load": of_load,
@@ -355,4 +372,5 @@ ROWS: dict[str, Callable[[Figures], list[str]]] = {
     "listening": of_listening,
     "fast": of_fast,
     "page": of_page,
+    "preview": of_preview,
 }

@@ -36,19 +36,23 @@ from loopwright.tuning.fast.proposal import ultimate
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.relay_test import FIRST_AMPLITUDE, MIN_OUTPUT_RANGE, max_amplitude
 from loopwright.tuning.five_stage.procedure import five_stage
-from loopwright.tuning.models import Model, TransferFunction, monic, sign, time_constants
+from loopwright.tuning.models import Model, TransferFunction, sign, time_constants
 from loopwright.tuning.plan import Command, Mode, Note, Plan, StageDone, StageStarted, Work
 from loopwright.tuning.reasons import Ended
 
 SAMPLES_PER_PERIOD, SAMPLES_PER_T95 = 60, 100
 """A loop that is sampled faster than this many times in its ultimate period, and in T95, is simulated at this rate."""
 MOST_SAMPLES = 100_000
-DEVIATIONS = 2.0
-"""Standard deviations of the model within which it is taken to be."""
+DEVIATIONS, STEP = 2.0, 0.05
+"""Standard deviations of the model within which it is taken to be, and those by which it is moved to see what that does
+to PV: farther off, a model of which a record tells little is another plant."""
 NOISES = 3.0
 """Standard deviations of its noise by which PV is beyond where the plant is."""
 MARGIN, MARGIN_UNKNOWN = 0.03, 0.1
 """What is added to the way of PV, as a part of it: of a model with a covariance, and of one without."""
+MOST_OPEN = 0.5
+"""The largest part of the way of PV that the uncertainty of the model adds: where a small move of the model makes the
+test take another turn, its effect is no measure of that."""
 ROUGH = 2.0
 """Factor within which the way of PV is known by a rough model."""
 SIZED_TO, MAX_SIZED = 0.95, 4
@@ -178,28 +182,28 @@ def _stages(asked: _Asked) -> dict[str, Reach]:
     margin = ROUGH if asked.known.rough else 1.0 + (MARGIN_UNKNOWN if asked.known.covariance is None else MARGIN)
     noises, found = NOISES * asked.noise, {}
     for stage, (low, high) in likely.items():
-        axes = [[each[stage] for each in pair if stage in each] for pair in zip(others[::2], others[1::2], strict=True)]
-        down = math.hypot(*(max([low - each[0] for each in axis], default=0.0) for axis in axes))
-        up = math.hypot(*(max([each[1] - high for each in axis], default=0.0) for axis in axes))
-        down, up = max(down, 0.0) - low, max(up, 0.0) + high
+        near = [each[stage] for each in others if stage in each]
+        open_down, open_up = (math.hypot(*(each[side] - at for each in near)) for side, at in ((0, low), (1, high)))
+        down = min(DEVIATIONS / STEP * open_down, -MOST_OPEN * low) - low
+        up = min(DEVIATIONS / STEP * open_up, MOST_OPEN * high) + high
         found[stage] = Reach(margin * down + noises, margin * up + noises, noises - low, noises + high)
     return found
 
 
 def _neighbours(known: LoopModel) -> Iterator[Model]:
-    """The models at the two ends of each axis of what the known one may be."""
+    """A model near the known one on each axis of what it may be."""
     if known.covariance is None:
         return
-    num, den = monic(known.model)
+    num, den = (np.asarray(each) / known.model.den[0] for each in (known.model.num, known.model.den))
     parameters = np.array([*num, *den[1:], known.model.L])
     covariance = np.array(known.covariance)
     if covariance.shape != (len(parameters), len(parameters)):
         return
-    sizes, axes = np.linalg.eigh(covariance)
+    errors = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+    sizes, axes = np.linalg.eigh(covariance / np.outer(errors, errors))
     for size, axis in zip(sizes, axes.T, strict=True):
-        for way in (1.0, -1.0):
-            at = parameters + way * DEVIATIONS * math.sqrt(max(size, 0.0)) * axis
-            yield TransferFunction(tuple(at[: len(num)]), (1.0, *at[len(num) : -1]), max(float(at[-1]), 0.0))
+        at = parameters + STEP * math.sqrt(max(size, 0.0)) * errors * axis
+        yield TransferFunction(tuple(at[: len(num)]), (1.0, *at[len(num) : -1]), max(float(at[-1]), 0.0))
 
 
 def _ranges(asked: _Asked, model: Model) -> dict[str, tuple[float, float]]:

@@ -20,7 +20,7 @@ from loopwright.tuning.fast.manual_procedure import MANUAL
 from loopwright.tuning.fast.pulse_levels import RESTED, candidate_models
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.structures import INTEGRATOR
-from loopwright.tuning.models import Model
+from loopwright.tuning.models import Integrating, Model, Reals
 from loopwright.tuning.plan import Sample
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -29,6 +29,8 @@ LOOKED_AT = 5
 MOVING = ("baseline", "pulses", "relay", MANUAL)
 """The stages that move the loop first."""
 MIN_SAMPLES = 10
+SHOWS = 5.0
+"""Standard deviations of its noise from which on a deviation of PV is more than that."""
 
 
 def loop_model(
@@ -94,8 +96,29 @@ def model_of_samples(rest: Sequence[Sample], moved: Sequence[Sample], reverse: b
     at_rest = np.arange(len(t)) < len(rest)
     u = np.where(at_rest, 0.0, mv - float(np.mean(mv[at_rest])))
     y = pv - float(np.mean(pv[at_rest]))
+    action, Ts, noise = 1.0 if reverse else -1.0, float(np.median(np.diff(t))), float(np.std(y[at_rest]))
+    hidden = np.flatnonzero(np.abs(y) <= SHOWS * noise)
+    since = int(hidden[-1]) if len(hidden) else 0
+    # what MV does within a dead time of the end does not show yet
+    acting = u[len(rest) : len(y) - max(0, since - len(rest))]
+    if len(acting) and np.ptp(acting) == 0.0:
+        return _from_one_step(float(acting[0]), y, Ts, len(moved), action, since)
     try:
-        found = candidate_models(u, y, float(np.median(np.diff(t))), 1.0 if reverse else -1.0, (INTEGRATOR,))
+        found = candidate_models(u, y, Ts, action, (INTEGRATOR,))
     except Refused:
         return None
     return found[0] if found else None
+
+
+def _from_one_step(step: float, y: Reals, Ts: float, samples: int, action: float, since: int) -> Model | None:
+    """The dead time and the slope of PV since it shows, where MV has made one step: a fit to the few samples of a fast
+    rise takes the rise for noise.
+
+    step: of MV, MV units. y: PV, as a deviation from rest, PV units. samples: those since the step.
+    since: the last sample at which PV is no more than noise away.
+    """
+    rising = len(y) - 1 - since
+    if step == 0.0 or rising == 0 or (y[-1] - y[since]) * step * action <= 0.0:
+        return None
+    slope = float(y[-1] - y[since]) / (rising * Ts)
+    return Integrating(slope / step, max(0.0, (samples - 1) * Ts - float(y[-1]) / slope))

@@ -388,7 +388,7 @@ def _goes(found: Preview, unit: str) -> str:
         pv = f"PV is expected between {_pv(found.pv_low, found)} and {_pv(found.pv_high, found)} {unit}"
         return f"{mv}{', ' if mv else ''}{pv}, by {found.pv_known_by}."
     partly = [each for each in found.stages if each.pv_low is not None and each.pv_high is not None]
-    pv = "How far PV goes is not known beforehand: no model of this loop is known."
+    pv = "How far PV goes is not known beforehand: no model of this loop tells it."
     if partly:
         of = "; ".join(f"{s.stage} {_pv(s.pv_low, found)} to {_pv(s.pv_high, found)} {unit}" for s in partly)
         pv = f"How far PV goes is known of some stages alone, by {found.pv_known_by}: {of}."

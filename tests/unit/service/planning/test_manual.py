@@ -95,7 +95,7 @@ class TestPreview:
         assert found.first_mv_move_pct is not None and found.first_mv_move_pct <= 4.0
         assert "in manual again, manual output" in found.on_abort
         assert [each.excitation for each in found.excitations] == ["manual"]
-        assert any("from where it is now" in line for line in found.summary)
+        assert any("How far PV goes is not known beforehand" in line for line in found.summary)
 
     @pytest.mark.parametrize(
         ("direction", "reverse", "side"),

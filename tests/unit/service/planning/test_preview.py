@@ -16,7 +16,7 @@ from loopwright.service.observing.knowledge import known
 from loopwright.service.planning.moves import broken_limits
 from loopwright.service.planning.obstacles import Now
 from loopwright.service.planning.preview import LastProposal, Preview, duration_text, preview
-from loopwright.service.results import Finding, FindingSource, KnowledgeView, UltimateView
+from loopwright.service.results import Finding, FindingSource, KnowledgeView
 from loopwright.service.security.keys import Scope
 from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.knowledge import Known
@@ -110,8 +110,7 @@ class TestMoves:
         assert (stages["verify"].sp_low, stages["verify"].sp_high) == (50.0, 52.0)
         assert stages["preflight"].mv_move_pct == stages["design"].mv_move_pct == 0.0
         assert (found.largest_mv_move_pct, found.largest_sp_move, found.would_start) == (60.0, 2.0, True)
-        assert stages["verify"].pv_move == 2.8
-        assert relay.pv_move is found.largest_pv_move is None, "nothing bounds the first wave but MV"
+        assert relay.pv_move is stages["verify"].pv_move is found.largest_pv_move is None, "no model is known"
         assert found.first_mv_move_pct is not None and found.first_mv_move_pct <= 30.0
         assert (found.watched.pv.low, found.watched.pv.high, found.watched.max_time_s) == (0.0, 100.0, 900.0)
 
@@ -139,7 +138,7 @@ class TestMoves:
         stages = {each.stage: each for each in found.stages}
         assert list(stages) == ["preflight", "trial", "pulses", "design", "verify", "redesign"]
         assert stages["trial"].what.startswith("Only where operation has shown the plant well enough")
-        assert (stages["trial"].sp_low, stages["trial"].sp_high, stages["trial"].pv_move) == (50.0, 52.0, 4.0)
+        assert (stages["trial"].sp_low, stages["trial"].sp_high) == (50.0, 52.0)
         assert stages["pulses"].duration_low_s == 0.0 < stages["trial"].duration_low_s
         alone = told(config={"test": {"excitations": ["observe"]}})
         assert [each.stage for each in alone.stages] == ["preflight", "design", "trial", "redesign"]
@@ -182,8 +181,8 @@ class TestMoves:
     def test_pulses_go_to_both_sides_of_the_set_point(self) -> None:
         stages = {each.stage: each for each in told(method="setpoint").stages}
         assert list(stages) == ["preflight", "pulses", "design", "verify", "redesign"]
-        assert (stages["pulses"].sp_low, stages["pulses"].sp_high, stages["pulses"].pv_move) == (48.0, 52.0, 4.0)
-        assert (stages["verify"].sp_low, stages["verify"].sp_high, stages["verify"].pv_move) == (50.0, 52.0, 2.8)
+        assert (stages["pulses"].sp_low, stages["pulses"].sp_high) == (48.0, 52.0)
+        assert (stages["verify"].sp_low, stages["verify"].sp_high) == (50.0, 52.0)
 
     def test_five_stage_tells_every_stage(self) -> None:
         found = told(method="five-stage")
@@ -226,15 +225,6 @@ class TestTime:
         assert ratios[1] < ratios[0]
         assert (other.known.Pu_s, other.known.model, other.known.model_job) == (3.32, "fopdt", "/jobs/abc")
         assert one.known.model is None and one.known.t95_s == 9.0
-
-    def test_the_last_model_tells_how_far_pv_goes(self) -> None:
-        """A relay of 40 % on a loop of Ku 200 % per degC: 4 * 40 / (pi * 200)."""
-        loop = LoopConfig.model_validate(loop_entry())
-        result = RESULT.model_copy(update={"ultimate": UltimateView(Ku=200.0, Pu_s=3.32)})
-        last = LastProposal.of("abc", None, 30.0, result)
-        five, fast = (preview(loop, retune_request(method=m), Now(STATE), last) for m in ("five-stage", "fast"))
-        assert five.stages[2].pv_move == pytest.approx(0.2546, abs=1e-4) and five.largest_pv_move is not None
-        assert fast.stages[1].pv_move == pytest.approx(0.75 * 60.0 * 4.0 / (3.1416 * 200.0), rel=1e-3)
 
     def test_the_stages_last_as_long_as_the_whole(self) -> None:
         for method in ("fast", "five-stage"):
@@ -393,6 +383,9 @@ class TestHttp:
         service.wait(client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()["id"])
         known = self.ask(client)["known"]
         assert (known["model_job"], known["Pu_s"]) == (f"/jobs/{jobs[0]}", 3.32)
+        after = self.ask(client)
+        assert after["pv_known_by"] == f"the model that job {jobs[0]} found"
+        assert after["pv_low"] < 50.0 < after["pv_high"], "computed by the pool, on that model"
 
     def test_limits_that_the_file_does_not_permit_are_told_with_the_rest(
         self, service: Service, client: TestClient
