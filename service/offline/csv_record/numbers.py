@@ -64,7 +64,7 @@ def number(cell: str, decimal: str) -> float | None:
 def without_unit(cells: Sequence[str]) -> tuple[list[str], str] | None:
     """Returns the cells of a column without the unit that all its numbers have behind them, and the unit; None for any
     other column."""
-    first = next((found for cell in cells if (found := _WITH_UNIT.match(cell.strip()))), None)
+    first = _WITH_UNIT.match(next((cell.strip() for cell in cells if not is_missing(cell)), ""))
     if first is None:
         return None
     unit, bare = first["unit"], []

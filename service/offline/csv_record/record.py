@@ -170,8 +170,9 @@ def _no_numbers(name: str, cells: list[str], lines: list[int], wrong: list[int])
         return []
     given = cells[wrong[0]].strip()
     many = f"values of {name} are not numbers, such as {given!r}"
-    hint = ": write numbers, such as 1 for open and 0 for closed" if plain(given) in TWO_STATES else ""
-    return [counted(lines, f"{name} is not a number: {given!r}", many) + hint]
+    two_states = plain(given) in TWO_STATES
+    hint = "write numbers, such as 1 for open and 0 for closed" if two_states else "leave cells without a value empty"
+    return [counted(lines, f"{name} is not a number: {given!r}", many) + f": {hint}"]
 
 
 def _held(name: str, cells: list[str], values: Reals, lines: Sequence[int]) -> list[str]:

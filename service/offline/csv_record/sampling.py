@@ -129,7 +129,7 @@ def _why_not(t: Reals, steps: Reals, doubtful: NDArray[np.intp]) -> str:
     if len(doubtful) == 1 and _is_hour(float(steps[doubtful[0]]), -_HOUR, float(np.median(steps))):
         return f": the clock went back by an hour there, as at the end of summer time; {_IN_UTC}"
     if any(steps[i] != 0.0 for i in doubtful):
-        return ""
+        return ": put the lines into the order of their times, or leave out those that go back"
     why = ": samples of the same time and other values; export fractions of a second, too, or "
     if len(doubtful) < 0.1 * len(t):
         return why + "delete one of them"

@@ -94,7 +94,8 @@ def read_table(text: str, chosen: Mapping[str, str], timed: bool = True) -> Tabl
         wrong.pop()  # "EOF", "120 rows": the end of a report
     short = f"values are missing, or too many: line {named} names {width} columns"
     many = f"lines have too few values or too many for the {width} columns"
-    problems = [counted(wrong, short, many)] if wrong else []
+    which = "it" if len(wrong) == 1 else "them"
+    problems = [f"{counted(wrong, short, many)}; complete or delete {which}"] if wrong else []
     described, most = 0, max(MAX_UNIT_LINES, sum(line < start for line in kept))
     while described < min(most, len(rows)) and not _is_sample(rows[described], columns):
         described += 1

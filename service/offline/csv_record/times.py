@@ -128,7 +128,8 @@ def _of_numbers(cells: Sequence[str], lines: Sequence[int], unit: str, name: str
         places = [lines[i] for i in wrong]
         given = cells[wrong[0]].strip()
         if not given:
-            raise Unusable(counted(places, f"{name} is missing", f"values of {name} are missing"))
+            missing = counted(places, f"{name} is missing", f"values of {name} are missing")
+            raise Unusable(f"{missing}; delete such lines, or give --every if the lines come evenly")
         one = f"{name} is neither a number of s nor a date and time: {given!r}; --time-format says how it is written"
         raise Unusable(counted(places, one, f"values of {name} are not numbers as those before, such as {given!r}"))
     if (size_s := seconds_in(unit)) is not None:

@@ -53,8 +53,11 @@ def is_on_or_off(cell: str) -> bool:
 
 def switched(cells: Sequence[str]) -> tuple[list[str], str] | None:
     """Returns a column of words for on and off as 1 and 0, and the words; None for any other column."""
+    first = next((cell for cell in cells if not is_missing(cell)), "")
+    if not is_on_or_off(first):
+        return None
     words = {cell: plain(cell) for cell in dict.fromkeys(cells) if not is_missing(cell)}
-    if not words or any(word not in ON and word not in OFF for word in words.values()):
+    if any(word not in ON and word not in OFF for word in words.values()):
         return None
     figures = {cell: "1" if word in ON else "0" for cell, word in words.items()}
     said = ", ".join(f"{cell.strip()!r} as {figures[cell]}" for cell in words)

@@ -102,20 +102,22 @@ def test_every_error_is_listed_with_its_line() -> None:
     assert str(caught.value).startswith("log.csv: 4 errors")
     assert caught.value.problems == [
         "line 9: t is neither a number of s nor a date and time: 'zwei'; --time-format says how it is written",
-        "line 8: values are missing, or too many: line 2 names 4 columns",
-        "2 values of u are not numbers, such as 'x', in lines 4, 9",
-        "line 9: sp is not a number: 'inf'",
+        "line 8: values are missing, or too many: line 2 names 4 columns; complete or delete it",
+        "2 values of u are not numbers, such as 'x', in lines 4, 9: leave cells without a value empty",
+        "line 9: sp is not a number: 'inf': leave cells without a value empty",
     ]
 
 
 def test_of_each_kind_of_error_the_first_lines_are_named() -> None:
     with pytest.raises(RecordError) as caught:
         parse_record("t,u,y\n" + "".join(f"{k},?!,1\n" for k in range(400)), "log.csv")
-    assert caught.value.problems == ["400 values of u are not numbers, such as '?!', first in lines 2, 3, 4, 5, 6"]
+    assert caught.value.problems == [
+        "400 values of u are not numbers, such as '?!', first in lines 2, 3, 4, 5, 6: leave cells without a value empty"
+    ]
 
 
 def test_times_that_do_not_increase() -> None:
-    with pytest.raises(RecordError, match=r"line 4: the time does not increase$"):
+    with pytest.raises(RecordError, match=r"line 4: the time does not increase: put the lines into the order"):
         parse_record("t,u,y\n0,1,2\n2,1,2\n1,1,2\n3,1,2\n", "log.csv")
     with pytest.raises(RecordError, match="2 times do not increase, in lines 3, 5: samples of the same time"):
         parse_record("t,u,y\n10:00:00,1,2\n10:00:00,1,3\n10:00:01,1,4\n10:00:01,1,5\n", "log.csv")
