@@ -99,7 +99,7 @@ def method_of(name: str) -> Method:
     if name == BY_MODEL.name:
         return BY_MODEL
     if name not in METHODS:
-        known = f"{BY_MODEL.name}, {', '.join(METHODS)}"
+        known = ", ".join((*METHODS, BY_MODEL.name))
         raise Refused(Reason.BAD_INPUT, f"method must be one of {known}, not {name!r}")
     return METHODS[name]
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, RootModel
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, RootModel, ValidationError
 
 from loopwright.service.api.openapi_document import Schema, schemas_of
 from loopwright.service.live.snapshot import JobProgress
@@ -138,10 +139,13 @@ class JobEventView(RootModel[Annotated[Stored | ProgressEvent, Field(discriminat
 
 
 def event_view(event: JobEvent) -> StoredEventView:
-    """The view of a stored event."""
-    return StoredEventView.model_validate(
-        event.shown() | {"id": event.seq, "kind": event.kind, "at": event.at, "plant_time_s": event.plant_time_s}
-    )
+    """The view of a stored event. One that an older or a newer version has stored in a form of its own is a note."""
+    common = {"id": event.seq, "at": event.at, "plant_time_s": event.plant_time_s}
+    try:
+        return StoredEventView.model_validate(event.shown() | common | {"kind": event.kind})
+    except ValidationError:
+        text = f"{event.kind}: {json.dumps(event.data)}"
+        return StoredEventView.model_validate(common | {"kind": "note", "text": text})
 
 
 def progress_view(found: JobProgress, after: int) -> ProgressEvent:

@@ -176,7 +176,7 @@ def test_absent_node(service: Service, client: TestClient) -> None:
     ],
 )
 def test_bad_requests(shared_client: TestClient, body: dict[str, Any], reason: str, words: str) -> None:
-    problem = assert_problem(shared_client.post(f"/loops/{TAG}/retune", json=body), 422)
+    problem = assert_problem(shared_client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"} | body), 422)
     assert problem["reason"] == reason and words in problem["detail"]
     assert shared_client.get("/jobs").json() == []
 
@@ -324,7 +324,7 @@ def test_a_stream_reads_a_long_history_in_parts(service: Service, client: TestCl
     job_id = url.removeprefix("/jobs/")
     with service.store.writing() as session:
         for n in range(450):
-            append(session, job_id, "decision_begun", {"decision": "accept", "n": n}, 0.0)
+            append(session, job_id, "decision_begun", {"decision": "accept", "by": str(n)}, 0.0)
     found = events(client.get(f"{url}/events").text)
     assert [number for number, _, _ in found] == list(range(1, len(found) + 1)) and len(found) > 450
-    assert [data["n"] for _, kind, data in found if kind == "decision_begun"] == list(range(450))
+    assert [data["by"] for _, kind, data in found if kind == "decision_begun"] == list(map(str, range(450)))

@@ -49,7 +49,7 @@ def test_a_busy_loop_is_named_with_its_job(service: Service, client: TestClient)
     ("path", "words"),
     [
         ("/jobs?stat=running", "query.stat: there is no such query parameter; did you mean state?; the parameters are"),
-        ("/methods?verbose=1", "query.verbose: there is no such query parameter; there are none"),
+        ("/healthz?verbose=1", "query.verbose: there is no such query parameter; there are none"),
         (f"/loops/{TAG}?x=1", "query.x"),
     ],
 )

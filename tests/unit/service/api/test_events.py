@@ -14,6 +14,7 @@ from jsonschema import Draft202012Validator
 from loopwright.service.api import event_views
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.live.snapshot import progress_of
+from loopwright.service.store.jobs import JobEvent
 from loopwright.tuning.plan import StageStarted
 from tests.unit.service.api.test_api import start
 from tests.unit.service.fakes import Service
@@ -80,6 +81,12 @@ def test_a_progress_event_says_when_it_was_and_where_the_stream_goes_on(service:
     assert (view.id, view.kind) == (4, "progress") and view.at.endswith("Z")
     service.tune.hold.set()
     service.wait(job)
+
+
+def test_an_event_of_another_version_is_a_note() -> None:
+    event = JobEvent(job_id="a", seq=3, at="2026-01-31T12:00:00.000Z", plant_time_s=0.0, kind="held", data={"by": "x"})
+    shown = event_views.event_view(event).root
+    assert isinstance(shown, event_views.NoteEvent) and shown.id == 3 and shown.text == 'held: {"by": "x"}'
 
 
 class At:

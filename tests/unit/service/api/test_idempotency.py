@@ -262,7 +262,7 @@ def test_keys_are_of_who_asks(service: Service) -> None:
 def test_what_was_not_understood_may_be_corrected_under_the_same_key(service: Service, client: TestClient) -> None:
     assert post(client, RETUNE, {"ms": 9}).status_code == 422
     assert post(client, "/loops/NONE/retune").status_code == 404
-    assert post(client, RETUNE, {"ms": 1.4}).status_code == 202
+    assert post(client, RETUNE, {"ms": 1.4, "requested_by": "me"}).status_code == 202
 
 
 def test_what_failed_is_tried_anew(service: Service, client: TestClient) -> None:

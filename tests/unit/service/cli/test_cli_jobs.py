@@ -516,7 +516,7 @@ def test_rehearse_speaks_like_retune(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("plant", "words"),
     [
-        ({"K": 0.8, "T": 120, "L_s": 15}, "T: not a quantity of the form {K, T_s, L_s}"),
+        ({"K": 0.8, "tau": 120, "L_s": 15}, "tau: not a quantity of the form {K, T_s, L_s}"),
         ({"num": [1.0]}, "den: it is missing"),
         ({"K": 0.8, "T_s": 120, "L_s": 15, "seed": -1}, "seed: a number of at least 0 is expected, not -1"),
     ],

@@ -71,6 +71,14 @@ def test_a_broken_connection_is_repeated_once_with_the_same_key(
         client.post("/loops/TIC-101/retune")
 
 
+@pytest.mark.parametrize(("status", "ends"), [(422, 2), (404, 2), (401, 2), (409, 3), (500, 1)])
+def test_the_exit_status_says_who_can_put_it_right(monkeypatch: pytest.MonkeyPatch, status: int, ends: int) -> None:
+    client, _ = through(monkeypatch, httpx.Response(status, json={"detail": "why"}))
+    with pytest.raises(ApiError, match="why") as refused:
+        client.get("/loops/TIC-101")
+    assert refused.value.status == ends
+
+
 def test_every_post_has_a_key_of_its_own_and_a_get_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
     client, sent = through(monkeypatch, *(httpx.Response(200, json={}) for _ in range(3)))
     client.post("/a")

@@ -130,7 +130,8 @@ MISTAKES = [
         {"operation.csv": IN_AUTOMATIC["scada"].content},
     ),
     Mistake("A model is not complete.", "tune --model '{\"K\": 0.8}'"),
-    Mistake("Names are without their units.", 'tune --model \'{"K": 0.8, "T": 120, "L": 15}\''),
+    Mistake("Names are those of a textbook.", 'tune --model \'{"K": 0.8, "tau": 120, "theta": 15}\''),
+    Mistake("A value of a model is no number.", "tune --model K=0.8,T=2min,L=15"),
     Mistake("A time is negative.", 'tune --model \'{"K": 0.8, "T_s": -120, "L_s": 15}\''),
     Mistake("The gain is 0.", 'tune --model \'{"K": 0, "T_s": 120, "L_s": 15}\''),
     Mistake("The dead time is given in ms.", 'tune --model \'{"K": 0.8, "T_s": 120, "L_s": 15000000}\''),
@@ -154,7 +155,7 @@ MISTAKES = [
     Mistake("A tab in YAML.", "check loops.yaml", site(("    t95_s", "\tt95_s"))),
     Mistake("loops.yaml is not here.", "check loops.yaml"),
     Mistake("No service runs.", "loops --url http://127.0.0.1:9", {}, 1),
-    Mistake("The address of the service lacks http.", "loops --url 127.0.0.1:8080", {}, 1),
+    Mistake("The address of the service lacks http.", "loops --url 127.0.0.1:8080"),
     Mistake("A node-ID is too large.", "serve --node 200"),
 ]  # fmt: skip
 

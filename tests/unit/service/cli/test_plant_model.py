@@ -44,7 +44,7 @@ def test_what_a_plant_has_besides_reaches_the_plant_process() -> None:
     assert answer[-1] == pytest.approx(65.0 + 1.4 * 9.0 * 0.8, abs=1e-3)
 
 
-@pytest.mark.parametrize("given", ['{"K": 0.8, "T": 120, "L_s": 15}', "{", "[]{}", '{"K": 0, "T_s": 1, "L_s": 1}'])
+@pytest.mark.parametrize("given", ['{"K": 0.8, "tau": 120, "L_s": 15}', "{", "[]{}", '{"K": 0, "T_s": 1, "L_s": 1}'])
 def test_what_is_no_model_is_refused_in_words(given: str, capsys: pytest.CaptureFixture[str]) -> None:
     if not given.startswith("{"):
         assert model_of("--model", given) == given  # perhaps a name: the plant process says which there are

@@ -140,7 +140,7 @@ def test_fast_designs_for_every_form() -> None:
             {"method": "simc", "start": "optimise", "model": {"K": 1, "L_s": 1, "integrating": True}},
             "simc takes a model of the form K, T_s, L_s",
         ),
-        ({"start": "design", "model": {"K": 2, "T": 10, "L": 3}}, "T, L: not a quantity of the form {K, T_s, L_s}"),
+        ({"start": "design", "model": {"K": 2, "tau": 10, "theta": 3}}, "tau, theta: not a quantity of the form"),
     ],
 )
 def test_what_is_refused_and_how(options: dict[str, Any], words: str) -> None:
