@@ -137,13 +137,13 @@ ADVICE: dict[Reason, str] = {
     "robust loop ask for another Ms, for a proposal all the same set propose_anyway.",
     Reason.PV_LIMIT: "PV reached its limit: permit less MV deviation, or widen the PV limits if it is safe.",
     Reason.TIME_BUDGET: "The test took longer than its budget: check T95, or raise the budget.",
-    Reason.BAD_SAMPLE: "PV was not a finite number, or jumped as the plant cannot: check the sensor and its scaling. "
-    "Where the loop was put in manual for it, control it by hand; when PV is right again, sign the alarm off (or "
-    "loopwright dismiss TAG), put the loop in automatic, then retune.",
+    Reason.BAD_SAMPLE: "PV was not a finite number, or another one than the plant can give: check the sensor and its "
+    "scaling. Where the message says that PV is false, see that the loop is in manual, and control it by hand; when PV "
+    "is right again, sign the alarm off (or loopwright dismiss TAG), put the loop in automatic, then retune.",
     Reason.SAMPLES_LOST: "Samples were lost on the way: check bus load, or run a simulated plant more slowly.",
-    Reason.PV_FROZEN: "PV stood still, or had another noise, as the plant cannot: check the sensor. A loop that was in "
-    "automatic was put in manual for it: control it by hand; when PV is right again, sign the alarm off (or loopwright "
-    "dismiss TAG), put the loop in automatic, then retune.",
+    Reason.PV_FROZEN: "PV stood still, or had another noise, as the plant cannot: check the sensor, see that the loop "
+    "is in manual (the message says what it was left in), and control it by hand; when PV is right again, sign the "
+    "alarm off (or loopwright dismiss TAG), put the loop in automatic, then retune.",
     Reason.SETPOINT_CHANGED: "Somebody else moved the set-point during the test; agree on the time and repeat.",
     Reason.MODE_CHANGED: "Somebody else changed the mode during the test; agree on the time and repeat.",
     Reason.GAINS_CHANGED: "Somebody else tried other gains during the test; agree on the time and repeat.",

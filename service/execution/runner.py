@@ -202,6 +202,8 @@ class _Run(Generic[T]):
             self._loop.hold()
         except Ended as ended:
             self._on_event(Note(f"the loop could not be held: {ended.detail}"))
+        except Exception as defect:  # it is restored all the same
+            self._on_event(Note(f"the loop could not be held, by a defect: {defect!r}"))
 
     def _restore(self, home: LoopState) -> None:
         """Restores the loop. A loop whose restoration is not confirmed leaves no proposal."""

@@ -291,6 +291,24 @@ def test_a_frozen_pv_is_noticed_once_mv_has_moved_and_the_loop_is_held() -> None
     assert ["PV is false: PV" in notes[0], "in manual at MV 0" in notes[1]] == [True, True], notes
 
 
+def test_a_defect_in_the_way_to_HOLD_keeps_no_loop_from_being_restored() -> None:
+    class Defective(Meddled):
+        def hold(self) -> None:
+            raise ValueError("no")
+
+    def plan() -> Plan[None]:
+        yield ()
+        raise FalsePv(Reason.BAD_SAMPLE, "PV went from 1 to 2")
+
+    notes: list[str] = []
+    result = run(
+        plan(), Defective(), limits=RunLimits(),
+        on_event=lambda e: notes.append(e.text) if isinstance(e, Note) else None,
+    )  # fmt: skip
+    assert isinstance(result.ended, FalsePv) and result.restored is not None
+    assert "could not be held, by a defect: ValueError('no')" in notes[1]
+
+
 def test_a_false_pv_stays_the_reason_where_the_loop_cannot_be_held_or_read_back() -> None:
     class Away(Meddled):
         def hold(self) -> None:
