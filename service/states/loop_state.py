@@ -63,7 +63,7 @@ def after_false_pv(state: LoopState) -> str:
     """Returns in words what a loop was left in by a test that has found PV to be false, and who has to act."""
     if state.mode is Mode.AUTOMATIC:
         return (
-            "PV is false, and the loop was left in automatic: an operator has to look at it now, and to put it in manual"
+            "PV is false, and the loop was left in automatic: an operator has to look at it now, and put it in manual"
         )
     return (
         f"PV is false: the loop was left in {state.mode.name.lower()} at MV {state.held_mv:.6g}, and nothing controls "
