@@ -12,14 +12,14 @@ from __future__ import annotations
 import argparse
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 from benchmarks.cases import ASKED
 from benchmarks.plants import Plant, plant_of
 from benchmarks.trouble.cases import FINE, Made, build
-from benchmarks.trouble.chain import Build, Chain, Setting
+from benchmarks.trouble.chain import Build, Chain, Part, Setting
 from benchmarks.trouble.sensors import Held, OnChange, Quantised, Wrong
 from benchmarks.trouble.valves import STROKE, RateLimit, Stepped, Switched
 from loopwright.controller.channel import Channel, Settings
@@ -74,10 +74,10 @@ def kinds() -> Iterator[Hidden]:
         made = build(sensor=partial(Held, count=count))
         yield Hidden("PV renewed seldom", f"every {count} samples", made, "PV is renewed every")
     for band in (0.25, 0.5, 0.8):
-        made = build(sensor=lambda setting, band=band: OnChange(band))
+        made = build(sensor=_alone(OnChange, band))
         yield Hidden("PV sent on change", f"of {band:g} degC", made, "PV is sent only where")
     for step in (0.2, 0.4, 0.8):
-        made = build(sensor=lambda setting, step=step: Quantised(step))
+        made = build(sensor=_alone(Quantised, step))
         yield Hidden("PV rounded", f"to {step:g} degC", made, "PV is rounded")
     for one_in, by in ((33, 8.0), (80, 20.0), (80, 1.0)):
         made = build(sensor=partial(Wrong, one_in=one_in, by=by))
@@ -175,6 +175,11 @@ def _lags(K: float, L: float, *T_s: float) -> TransferFunction:
     for T in T_s:
         den = [a * T + b for a, b in zip([*den, 0.0], [0.0, *den], strict=True)]
     return TransferFunction((K,), tuple(den), L)
+
+
+def _alone(made: Callable[[float], Part], size: float) -> Made:
+    """A part that needs no setting."""
+    return lambda setting: made(size)
 
 
 def _before(made: Made) -> Build:

@@ -37,9 +37,15 @@ SHARES = (-0.6, -0.4, -0.25, -0.15, -0.1, -0.05, 0.05, 0.1, 0.15, 0.25, 0.4, 0.6
 OTHER_FAULTS: dict[str, Fault] = {"backlash": backlash, "stiction": stiction, "saturation": saturation}
 OTHER_CHANGES = {"above rest": above_rest, "squared": squared, "cubed": cubed}
 """What else may explain a record, and is not named here."""
-CLEAR = 16.0
+APART = {"steps": 3, "window": 4}
+"""How many of its neighbours in the list of sizes are left out beside one that is fitted."""
+LEFT = 0.05
+"""Smallest part of MV's largest move that a fault leaves."""
+BEGUN = 3
+"""How many sizes of a kind that is named are refined."""
+CLEAR = 4.0
 """By how much a fault has to lower chi-squared in a score test to be fitted."""
-FITTED, REFINED = 3, 6
+FITTED, REFINED = 8, 6
 """How many sizes of each kind are fitted, and how often the best is refined."""
 STRUCTURES: tuple[Structure, ...] = (SECOND, SECOND_WITH_ZERO, THIRD)
 STEPS = 8
@@ -83,20 +89,24 @@ def find_mv_fault(fit: Fit[ExperimentRecord], best: Fitted, mv_at_rest: float) -
     record = fit.record
     if len(record.pieces) > 1:
         return None
-    (plain,) = fit_structures(fit, UNDISTURBED, structures=(SECOND,))
-    tests = ScoreTests(fit, plain)
+    # a structure that jumps with MV, or a poor minimum, may not know a fault that another one shows
+    of = [ScoreTests(fit, each) for each in (best, *fit_structures(fit, UNDISTURBED, structures=(SECOND,)))]
     likeliest: dict[str, tuple[Fitted, _Tried]] = {}
     for kind in _kinds(record, mv_at_rest):
-        tried = list(kind)
+        tried = [each for each in kind if _moves(each, record)]
         if not tried:
             continue
-        shares, deviations = tests.scores(np.array([each.u for each in tried]) - record.u)
-        decrease = np.where(np.isfinite(deviations), (2.0 * shares - 1.0) / np.square(deviations), 0.0)
+        changed = np.array([each.u for each in tried]) - record.u
+        scored = (tests.scores(changed) for tests in of)
+        decrease = np.max([(2.0 * shares - 1.0) / np.square(deviations) for shares, deviations in scored], axis=0)
         ranked = np.argsort(-decrease).tolist()
         if not decrease[ranked[0]] > CLEAR:
             continue
-        some = [tried[i] for i in _distinct(ranked, tried)]
-        likeliest[tried[0].kind] = _refined(record, mv_at_rest, plain, some)
+        name = tried[0].kind
+        some = [tried[i] for i in _distinct(ranked, APART.get(name, 1))]
+        # the score test of a large fault says little of its size
+        some += tried[::3] if name == "rate" else []
+        likeliest[name] = _refined(record, mv_at_rest, some, BEGUN if name in RIVAL else 1)
     named = {kind: each for kind, each in likeliest.items() if kind in RIVAL}
     if not named:
         return None
@@ -129,10 +139,8 @@ def _kinds(record: ExperimentRecord, mv_at_rest: float) -> Iterator[Iterator[_Tr
         yield (_other(record, name, share) for share in SHARES)
 
 
-def _refined(
-    record: ExperimentRecord, mv_at_rest: float, plain: Fitted, some: Sequence[_Tried]
-) -> tuple[Fitted, _Tried]:
-    """The best fit of one kind, and its size."""
+def _refined(record: ExperimentRecord, mv_at_rest: float, some: Sequence[_Tried], many: int) -> tuple[Fitted, _Tried]:
+    """The best fit of one kind, and its size, refined from so many of these sizes."""
     thetas: dict[Structure, Reals] = {}
 
     def fitted(each: _Tried, structures: Sequence[Structure] = (SECOND,)) -> Fitted:
@@ -141,28 +149,37 @@ def _refined(
             return moved.search(structures[0], UNDISTURBED, [thetas[structures[0]]], STEPS)
         return min(fit_structures(moved, UNDISTURBED, structures=structures), key=by_bic)
 
-    found, fault = min(((fitted(each), each) for each in some), key=lambda each: each[0].bic)
-    thetas[plain.structure] = found.theta
-    finer = 1.0
-    for _ in range(REFINED):
-        before = fault
-        for each in _near(record, mv_at_rest, fault, finer):
-            again = fitted(each)
-            if again.bic < found.bic:
-                found, fault = again, each
-                thetas[plain.structure] = found.theta
-        if fault is before:
-            finer *= 0.4
+    begun = sorted(((fitted(each), each) for each in some), key=lambda each: each[0].bic)[:many]
+    ended = []
+    for found, fault in begun:
+        thetas[SECOND] = found.theta
+        finer = 1.0
+        for _ in range(REFINED):
+            before = fault
+            for each in _near(record, mv_at_rest, fault, finer):
+                again = fitted(each) if _moves(each, record) else found
+                if again.bic < found.bic:
+                    found, fault = again, each
+                    thetas[SECOND] = found.theta
+            if fault is before:
+                finer *= 0.4
+        ended.append((found, fault))
+    found, fault = min(ended, key=lambda each: each[0].bic)
     last = fitted(fault, STRUCTURES)
     return (last if last.bic < found.bic else found), fault
 
 
-def _distinct(ranked: Sequence[int], tried: Sequence[_Tried]) -> list[int]:
-    """The likeliest sizes, as many as are fitted, none a neighbour of another."""
+def _moves(tried: _Tried, record: ExperimentRecord) -> bool:
+    """Whether the fault leaves something of MV's moves."""
+    return float(np.max(np.abs(tried.u))) > LEFT * record.input_range
+
+
+def _distinct(ranked: Sequence[int], apart: int) -> list[int]:
+    """The likeliest sizes, as many as are fitted, none within `apart` of another."""
     kept: list[int] = []
     for i in ranked:
-        if all(abs(i - k) > 1 for k in kept):
-            kept.append(int(i))
+        if all(abs(i - k) > apart for k in kept):
+            kept.append(i)
         if len(kept) == FITTED:
             break
     return kept
