@@ -112,8 +112,8 @@ def find_mv_fault(fit: Fit[ExperimentRecord], best: Fitted, mv_at_rest: float) -
         return None
     found, fault = min(named.values(), key=lambda each: each[0].bic)
     others = [each.bic for kind, (each, _) in likeliest.items() if kind != fault.kind]
-    noise, least = EXPLAINED
-    explained = found.rms <= max(noise * record.noise / record.output_range, least)
+    noises, of_range = EXPLAINED
+    explained = found.rms <= max(noises * record.noise / record.output_range, of_range)
     gain = best.bic - found.bic
     if not explained or gain < MIN_BIC_GAIN or found.bic > min(others, default=math.inf) - RIVAL[fault.kind]:
         return None
