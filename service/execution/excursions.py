@@ -29,7 +29,7 @@ from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.design_trial import designed_on, trial
-from loopwright.tuning.fast.expected_moves import NewGains, expected_moves
+from loopwright.tuning.fast.expected_moves import LAST_LEVEL_TURNS, NewGains, expected_moves
 from loopwright.tuning.fast.experiment import on_trial
 from loopwright.tuning.fast.procedure import FastOptions
 from loopwright.tuning.fast.proposal import ultimate
@@ -232,7 +232,9 @@ def _plans(asked: _Asked, model: Model) -> Iterator[tuple[Plan[Any], Mode]]:
     for each in tried:
         after_pulses = each is Excitation.RELAY and Excitation.SETPOINT in tried
         mode = Mode.MANUAL if each is Excitation.MANUAL else Mode.AUTOMATIC
-        yield expected_moves(each, facts, asked.noise, options, model, new, after_pulses), mode
+        ends = LAST_LEVEL_TURNS if each is Excitation.SETPOINT and new is not None else LAST_LEVEL_TURNS[:1]
+        for turns in ends:
+            yield expected_moves(each, facts, asked.noise, options, model, new, after_pulses, turns), mode
 
 
 @lru_cache(256)
