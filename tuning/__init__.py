@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from loopwright.tuning.analysis.margins import Margins, delay_margin_s, margins, ultimate_point
     from loopwright.tuning.analysis.step_figures import StepFigures
     from loopwright.tuning.analysis.step_response import Response, step_figures, step_response
+    from loopwright.tuning.fast.tuned import Tuned, tune
     from loopwright.tuning.gains import Gains, Parallel, Series, of_parallel, of_series, to_parallel, to_series
     from loopwright.tuning.identification.identify import Identified, identify
     from loopwright.tuning.identification.overshoot import fopdt_from_overshoot
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from loopwright.tuning.reduction.half_rule import half_rule
     from loopwright.tuning.reduction.moments_and_areas import moments, two_areas
     from loopwright.tuning.rules.registry import METHODS, Method
-    from loopwright.tuning.tuned import Tuned, tune
 
 _WHERE = {
     "analysis.assessment": ("Assessment", "assess"),
@@ -54,7 +54,7 @@ _WHERE = {
     "reduction.half_rule": ("half_rule",),
     "reduction.moments_and_areas": ("moments", "two_areas"),
     "rules.registry": ("METHODS", "Method"),
-    "tuned": ("Tuned", "tune"),
+    "fast.tuned": ("Tuned", "tune"),
 }
 _HOME = {name: module for module, names in _WHERE.items() for name in names}
 

@@ -91,7 +91,8 @@ ADVICE: dict[Reason, str] = {
     Reason.WRONG_SIGN: "Check the controller's action (direct/reverse) against the sign of the plant's gain.",
     Reason.NO_RESPONSE: "PV did not answer MV: check the valve, the sensor and that the right loop is selected.",
     Reason.CANNOT_OSCILLATE: "The plant has next to no dead time, or the sampling is too slow to see it "
-    "(22 samples a period at least): sample faster, or use a model-based rule.",
+    "(22 samples a period at least): sample faster, or use a model-based rule. Or T95 is stated far too short: state "
+    "it longer.",
     Reason.SAMPLING_TOO_SLOW: "Choose a sample time of at most a fiftieth of the ultimate period.",
     Reason.NO_BRACKET: "The ultimate gain was not found within a factor 8 of the relay's estimate; "
     "check for backlash, sticking or another loop acting on this one.",

@@ -19,7 +19,7 @@ from loopwright.service.inputs.request import FastRetune, RetuneRequest, narrow
 from loopwright.service.jobs.fleet import Fleet, FleetRequest
 from loopwright.service.jobs.loop_model import loop_model
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.planning.expected import NOTHING_EXPECTED, Expected
+from loopwright.service.planning.expected import NOTHING_EXPECTED, ExpectedPv
 from loopwright.service.planning.obstacles import Now
 from loopwright.service.planning.preview import FleetPreview, LastProposal, Preview, fleet_preview, preview
 from loopwright.service.states.loop_state import loop_state
@@ -77,7 +77,7 @@ def router(jobs: Jobs, fleet: Fleet, pool: Pool) -> APIRouter:
     return routes
 
 
-def _expected(jobs: Jobs, pool: Pool, config: LoopConfig, request: RetuneRequest, now: Now) -> Expected:
+def _expected(jobs: Jobs, pool: Pool, config: LoopConfig, request: RetuneRequest, now: Now) -> ExpectedPv:
     """How far PV is expected to go; nothing where no model is known, or no process is to be had for it."""
     state, (narrowed, problems) = now.state, narrow(config, request)
     if state is None or problems or request.dry_run:

@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, Field
 
-from loopwright.service.curves import LoopCurves
 from loopwright.service.inputs.model_json import ModelForm, form_shown
 from loopwright.service.inputs.validation import STRICT
+from loopwright.service.planning.curves import LoopCurves
 from loopwright.service.results import GainsView
 from loopwright.tuning.reasons import Reason
 from loopwright.tuning.rules.design import MIN_GM, MAX_Ms

@@ -8,7 +8,7 @@ from loopwright.service.api.job_views import LockView
 from loopwright.service.states.job_state import JobState
 
 
-class ProgressEvent(BaseModel):
+class ProgressShown(BaseModel):
     """How far a job is: the fraction done, and the expected plant time to the end, s (None: not known)."""
 
     stage: str | None
@@ -16,7 +16,7 @@ class ProgressEvent(BaseModel):
     remaining_plant_time_s: float | None
 
 
-class StageDoneEvent(BaseModel):
+class StageDoneShown(BaseModel):
     """A stage has ended with a result. plant_time_s: the plant time of the job so far, s."""
 
     stage: str
@@ -24,24 +24,24 @@ class StageDoneEvent(BaseModel):
     result: dict[str, JsonValue] | None
 
 
-class NoteEvent(BaseModel):
+class NoteShown(BaseModel):
     """A note for the user."""
 
     text: str
 
 
-class StateEvent(BaseModel):
+class StateShown(BaseModel):
     """The job has a new state."""
 
     state: str
 
 
-ShownEvent = ProgressEvent | StageDoneEvent | NoteEvent | StateEvent
+ShownEvent = ProgressShown | StageDoneShown | NoteShown | StateShown
 SHOWN_EVENTS: dict[str, type[ShownEvent]] = {
-    "progress": ProgressEvent,
-    "stage_done": StageDoneEvent,
-    "note": NoteEvent,
-    "state": StateEvent,
+    "progress": ProgressShown,
+    "stage_done": StageDoneShown,
+    "note": NoteShown,
+    "state": StateShown,
 }
 """The events of GET /jobs/{id}/events that the commands show, by kind."""
 

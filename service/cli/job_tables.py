@@ -12,7 +12,7 @@ from loopwright.service.api.job_views import JobView, LockView, LoopDetail
 from loopwright.service.api.report.words import stage_found, stage_name
 from loopwright.service.api.watch_views import WatchView
 from loopwright.service.cli import terminal
-from loopwright.service.cli.answers import SHOWN_EVENTS, NoteEvent, ProgressEvent, StageDoneEvent, StateEvent
+from loopwright.service.cli.answers import SHOWN_EVENTS, NoteShown, ProgressShown, StageDoneShown, StateShown
 from loopwright.service.cli.client import Client, parsed
 from loopwright.service.cli.result_table import ShownResult, result_table
 from loopwright.service.cli.terminal import cell, figure
@@ -36,16 +36,16 @@ def follow(client: Client, job_url: str, to: Console | None = None) -> JobView:
         for kind, data in client.events(job_url):
             form = SHOWN_EVENTS.get(kind)
             match None if form is None else parsed(form, data):
-                case ProgressEvent(stage=stage, progress=progress, remaining_plant_time_s=left):
+                case ProgressShown(stage=stage, progress=progress, remaining_plant_time_s=left):
                     text = "" if left is None else f"about {left:.0f} s of plant time left"
                     bars.update(task, completed=progress, description=stage or "", left=text)
-                case StageDoneEvent(stage=stage, plant_time_s=plant_time_s, result=result):
+                case StageDoneShown(stage=stage, plant_time_s=plant_time_s, result=result):
                     found = stage_found(stage, result, "") or "done"
                     line = f"  {stage_name(stage)}: {found} (after {plant_time_s:.1f} s of plant time)"
                     bars.console.print(line, soft_wrap=True, highlight=False)
-                case NoteEvent(text=text):
+                case NoteShown(text=text):
                     bars.console.print(f"  note: {text}", soft_wrap=True, highlight=False)
-                case StateEvent(state=state):
+                case StateShown(state=state):
                     bars.update(task, description=state, left="")
         job = parsed(JobView, client.awaited(job_url))
         # how far a job is may be told once more after its end

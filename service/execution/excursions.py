@@ -23,13 +23,13 @@ from loopwright.service.inputs.request import (
     RetuneRequest,
     excitations,
 )
-from loopwright.service.planning.expected import NOTHING_EXPECTED, Expected, LoopModel, Reach
+from loopwright.service.planning.expected import NOTHING_EXPECTED, ExpectedPv, LoopModel, Reach
 from loopwright.service.planning.facts import facts_of
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.design_trial import designed_on, trial
-from loopwright.tuning.fast.expected_moves import NewGains, expected_moves
+from loopwright.tuning.fast.expected_moves import LAST_LEVEL_TURNS, NewGains, expected_moves
 from loopwright.tuning.fast.experiment import on_trial
 from loopwright.tuning.fast.procedure import FastOptions
 from loopwright.tuning.fast.proposal import ultimate
@@ -63,7 +63,7 @@ STILL = ("preflight", "settle", "design", "redesign", "estimate", "optimise")
 """Stages that move nothing."""
 
 
-def excursions(config: LoopConfig, request: RetuneRequest, state: LoopState, known: LoopModel) -> Expected:
+def excursions(config: LoopConfig, request: RetuneRequest, state: LoopState, known: LoopModel) -> ExpectedPv:
     """Returns how far PV is expected to go in each stage; nothing where the model does not tell.
 
     config: the configuration with the limits of the job.
@@ -72,7 +72,7 @@ def excursions(config: LoopConfig, request: RetuneRequest, state: LoopState, kno
     return NOTHING_EXPECTED if asked is None else _within_limits(asked, config.pv_unit)
 
 
-def near_limits(config: LoopConfig, request: RetuneRequest, state: LoopState, known: LoopModel) -> Expected:
+def near_limits(config: LoopConfig, request: RetuneRequest, state: LoopState, known: LoopModel) -> ExpectedPv:
     """The same where PV may come near its limits, else nothing, which takes a tenth of the time."""
     asked = _asked(config, request, state, known)
     if asked is None:
@@ -121,7 +121,7 @@ def _asked(config: LoopConfig, request: RetuneRequest, state: LoopState, known: 
     return _Asked(config, request, state.mode, facts, known, rest)
 
 
-def _within_limits(asked: _Asked, unit: str) -> Expected:
+def _within_limits(asked: _Asked, unit: str) -> ExpectedPv:
     facts, stages = asked.facts, _stages(asked)
     relay, begins_with = stages.get("relay"), None
     adapted = isinstance(asked.request, FastRetune) and asked.request.amplitude_pct is None
@@ -137,7 +137,7 @@ def _within_limits(asked: _Asked, unit: str) -> Expected:
     moving = {stage: reach for stage, reach in stages.items() if stage not in STILL}
     first = next((stage for stage, reach in moving.items() if _breaks(asked, reach)), None)
     broken = () if first is None else (_sentence(asked, first, moving, unit),)
-    return Expected(asked.known.source, stages, begins_with, broken)
+    return ExpectedPv(asked.known.source, stages, begins_with, broken)
 
 
 def _share(reach: Reach, facts: Facts) -> float:
@@ -232,7 +232,9 @@ def _plans(asked: _Asked, model: Model) -> Iterator[tuple[Plan[Any], Mode]]:
     for each in tried:
         after_pulses = each is Excitation.RELAY and Excitation.SETPOINT in tried
         mode = Mode.MANUAL if each is Excitation.MANUAL else Mode.AUTOMATIC
-        yield expected_moves(each, facts, asked.noise, options, model, new, after_pulses), mode
+        ends = LAST_LEVEL_TURNS if each is Excitation.SETPOINT and new is not None else LAST_LEVEL_TURNS[:1]
+        for turns in ends:
+            yield expected_moves(each, facts, asked.noise, options, model, new, after_pulses, turns), mode
 
 
 @lru_cache(256)

@@ -19,7 +19,7 @@ from loopwright.service.inputs.request import (
     wrong_mode,
 )
 from loopwright.service.loops.loop import Loop
-from loopwright.service.planning.expected import NOTHING_EXPECTED, Expected, LoopModel
+from loopwright.service.planning.expected import NOTHING_EXPECTED, ExpectedPv, LoopModel
 from loopwright.service.planning.facts import facts_of, time_budget_s
 from loopwright.service.planning.ground import Ground, rehearsal_spec
 from loopwright.service.planning.moves import broken_from
@@ -153,7 +153,7 @@ def tune(
 
 def _expected_of(
     config: LoopConfig, request: RetuneRequest, state: LoopState, hooks: Hooks, workers: Workers | None
-) -> Expected:
+) -> ExpectedPv:
     """How far PV is expected to go, where it may come near its limits; nothing where that cannot be computed."""
     if hooks.model is None:
         return NOTHING_EXPECTED
@@ -169,7 +169,7 @@ def _expected_of(
 
 def expected(
     config: LoopConfig, request: RetuneRequest, state: LoopState, known: LoopModel, near_limits_alone: bool = False
-) -> Expected:
+) -> ExpectedPv:
     """How far PV is expected to go, see `service.execution.excursions`, which this process need not have loaded: it is
     a work for another one.
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from loopwright.service.curves import horizons, loop_curves
 from loopwright.service.errors import Conflict
 from loopwright.service.inputs.model_json import dump_model, parse_model
 from loopwright.service.jobs.stored_record import StoredRecord
 from loopwright.service.jsonable import JsonObject, json_object
 from loopwright.service.offline.tunings import MethodResult, answer, tune_each
+from loopwright.service.planning.curves import horizons, loop_curves
 from loopwright.service.planning.found_model import DISPROVED, FoundModel, found_model
 from loopwright.service.results import DESIGNED
 from loopwright.service.states.job_state import ACTIVE

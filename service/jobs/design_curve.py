@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 from pydantic import AliasChoices, Field
 
-from loopwright.service.curves import Horizons, LoopCurves, horizons, loop_curves
 from loopwright.service.jobs.alternatives import asked_spec, new_gains
 from loopwright.service.jsonable import json_object
+from loopwright.service.planning.curves import Horizons, LoopCurves, horizons, loop_curves
 from loopwright.service.results import Figures, GainsView, PerformanceView
 from loopwright.service.states.loop_state import gains_of, loop_state
 from loopwright.service.store.jobs import Job

@@ -18,11 +18,11 @@ from loopwright.service.offline.recommendation import recommended
 from loopwright.tuning.analysis.assessment import Assessment
 from loopwright.tuning.analysis.step_figures import StepFigures
 from loopwright.tuning.fast.by_model import BY_MODEL
+from loopwright.tuning.fast.tuned import method_of, tune
 from loopwright.tuning.gains import Gains, to_parallel
 from loopwright.tuning.models import Model
 from loopwright.tuning.reasons import Ended, Failed, Reason, Refused
 from loopwright.tuning.rules.registry import METHODS, Method, Option
-from loopwright.tuning.tuned import method_of, tune
 
 ALL = "all"
 FORM = "ISA: u = Kp*(b*SP - PV + integral(SP - PV)/Ti + Td*d/dt(c*SP - PV)/(1 + Tf*s)); Ti = 0: no integral"

@@ -46,7 +46,7 @@ class Reach:
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
+class ExpectedPv:
     """What a retune is expected to do to PV.
 
     source: the model that tells it, in words; empty where nothing does.
@@ -62,4 +62,4 @@ class Expected:
     broken: tuple[str, ...] = ()
 
 
-NOTHING_EXPECTED = Expected()
+NOTHING_EXPECTED = ExpectedPv()

@@ -12,7 +12,7 @@ from loopwright.service.inputs.config import Limits, LoopConfig
 from loopwright.service.inputs.request import FiveStages, RetuneRequest, narrow
 from loopwright.service.planning.durations import Span, durations
 from loopwright.service.planning.excitation_preview import ExcitationPreview, excitation_previews
-from loopwright.service.planning.expected import NOTHING_EXPECTED, Expected, Reach
+from loopwright.service.planning.expected import NOTHING_EXPECTED, ExpectedPv, Reach
 from loopwright.service.planning.facts import time_budget_s
 from loopwright.service.planning.moves import Before, Moves, moves, stages_asked
 from loopwright.service.planning.obstacles import Now, Obstacle, Occupied, obstacles
@@ -166,7 +166,7 @@ def preview(
     now: Now,
     last: LastProposal | None,
     knowledge: KnowledgeView | None = None,
-    expected: Expected = NOTHING_EXPECTED,
+    expected: ExpectedPv = NOTHING_EXPECTED,
 ) -> Preview:
     """Returns the preview of one loop.
 

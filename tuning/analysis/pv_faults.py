@@ -112,9 +112,9 @@ def wrong_samples(pv: Reals) -> tuple[NDArray[np.int64], float]:
     moved = np.abs(np.diff(pv))
     # a PV that is sent only where it has changed, or rounded, moves by no less than that
     usual = float(np.median(moved[moved > EQUAL * np.ptp(pv)])) if np.any(moved) else 0.0
-    least = max(WRONG * scale, MOVES * usual)
+    far = max(WRONG * scale, MOVES * usual)
     between = 0.5 * (np.concatenate((pv[:1], pv[:-1])) + np.concatenate((pv[1:], pv[-1:])))
-    found = (np.abs(away) > least) & (np.abs(away) > ALONE * spread) & (np.abs(pv - between) > 0.5 * np.abs(away))
+    found = (np.abs(away) > far) & (np.abs(away) > ALONE * spread) & (np.abs(pv - between) > 0.5 * np.abs(away))
     found[0] = found[-1] = False
     at = np.flatnonzero(found)
     alone = at[(np.diff(at, prepend=-9) > 1) & (np.diff(at, append=len(pv) + 9) > 1)]
@@ -135,12 +135,12 @@ def without_wrong_samples(pv: Reals) -> Reals:
 def rounding_step(pv: Reals) -> float:
     """The step to which PV is rounded, PV units: all of its levels are a whole number of such steps apart. 0 where none
     shows."""
-    span = float(np.ptp(pv))
-    if not span > 0.0:
+    output_range = float(np.ptp(pv))
+    if not output_range > 0.0:
         return 0.0
     levels = np.unique(pv)
     apart = np.diff(levels)
-    apart = apart[apart > max(EQUAL, 4.0 * _float_step(levels) / span) * span]
+    apart = apart[apart > max(EQUAL * output_range, 4.0 * _float_step(levels))]
     step = float(apart.min(initial=math.inf))
     if not math.isfinite(step) or len(apart) < 2:
         return 0.0
@@ -182,5 +182,5 @@ def _band(sizes: Reals, runs: NDArray[np.int64], rounded: float) -> float | None
     """The change from which on PV is sent, None where it is always sent."""
     if len(sizes) < MIN_ON_CHANGE or float(np.mean(runs > 1)) < HELD_ON_CHANGE:
         return None
-    least, usual = float(np.quantile(sizes, 0.02)), float(np.median(sizes))
-    return least if least > BAND * usual and least > JUMP * rounded else None
+    smallest, usual = float(np.quantile(sizes, 0.02)), float(np.median(sizes))
+    return smallest if smallest > BAND * usual and smallest > JUMP * rounded else None

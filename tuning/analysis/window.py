@@ -22,7 +22,7 @@ PEAK = 8.0
 """Power of a peak of the spectrum, in medians."""
 SPANS = ((0.0, 1.0), (0.0, 100.0))
 """What MV of a time-proportioned output is between: off all the time, on all the time."""
-SWINGS = 0.6
+OSCILLATES = 0.6
 """Part of the variance of PV at rest that one period has to make for PV to be said to swing."""
 MIN_WINDOWS = 4.0
 """Windows that the rest must hold to tell the length of one."""
@@ -67,14 +67,14 @@ def lengths(rest: Reals, Ts: float, longest: float) -> list[float]:
 
 
 @dataclass(frozen=True, slots=True)
-class Swing:
+class Oscillation:
     """What swings PV at rest: an MV that is switched in a window, or something of one period."""
 
     by_window: bool
     in_words: str
 
 
-def swing_at_rest(pv: Reals, mv: Reals, Ts: float) -> Swing | None:
+def oscillation_at_rest(pv: Reals, mv: Reals, Ts: float) -> Oscillation | None:
     """What swings PV while the loop rests, None where nothing does.
 
     pv, mv: absolute, PV and MV units, shape (N,). Ts: s.
@@ -96,13 +96,13 @@ def swing_at_rest(pv: Reals, mv: Reals, Ts: float) -> Swing | None:
 
     of_sine, length = min((by_sine(each), each) for each in near)
     of_window, window = min(_by_windows(rest, mv, near, trend), default=(math.inf, math.nan))
-    if of_sine > (1.0 - SWINGS) * variance and of_window > (1.0 - SWINGS) * variance:
+    if of_sine > (1.0 - OSCILLATES) * variance and of_window > (1.0 - OSCILLATES) * variance:
         return None
     by = float(np.quantile(rest, 0.98) - np.quantile(rest, 0.02))
     if (of_sine - of_window) / of_window * len(pv) > CLEARER:
         text = f"MV is switched on and off in a window of {window * Ts:.3g} s, which swings PV by {by:.2g} at rest"
-        return Swing(True, text)
-    return Swing(False, f"PV swings by {by:.2g} at rest, with a period of {length * Ts:.3g} s")
+        return Oscillation(True, text)
+    return Oscillation(False, f"PV swings by {by:.2g} at rest, with a period of {length * Ts:.3g} s")
 
 
 def _by_windows(rest: Reals, mv: Reals, near: list[float], trend: Reals) -> Iterator[tuple[float, float]]:

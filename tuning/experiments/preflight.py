@@ -13,7 +13,7 @@ import numpy as np
 
 from loopwright.tuning.analysis.pv_faults import pv_faults, without_wrong_samples
 from loopwright.tuning.analysis.sticking import find_sticking
-from loopwright.tuning.analysis.window import swing_at_rest
+from loopwright.tuning.analysis.window import oscillation_at_rest
 from loopwright.tuning.experiments.controller_mismatch import check_law_at_rest
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, record
 from loopwright.tuning.plan import Mode, Note, Plan, StageStarted, worked
@@ -140,6 +140,6 @@ def _named(reason: Reason, text: str, trace: Trace, facts: Facts) -> Refused:
     if wrong := pv_faults(pv).of_wrong_samples:
         without = float(np.std(np.diff(without_wrong_samples(pv)))) / math.sqrt(2)
         return Refused(reason, f"{wrong}, where the noise is {without:.2g} without them: {text}")
-    if (swing := swing_at_rest(pv, np.asarray(trace.mv), facts.sample_time_s)) is None:
+    if (oscillation := oscillation_at_rest(pv, np.asarray(trace.mv), facts.sample_time_s)) is None:
         return Refused(reason, text)
-    return Refused(Reason.MV_ALTERED if swing.by_window else reason, f"{swing.in_words}: {text}")
+    return Refused(Reason.MV_ALTERED if oscillation.by_window else reason, f"{oscillation.in_words}: {text}")

@@ -69,7 +69,7 @@ class MvFault:
 
 
 @dataclass(frozen=True, slots=True)
-class _Tried:
+class _MvFit:
     """A fault of one size: what it makes of MV in the record.
 
     kind: of the fault. size: what `_near` refines. u: MV units,
@@ -91,7 +91,7 @@ def find_mv_fault(fit: Fit[ExperimentRecord], best: Fitted, mv_at_rest: float) -
         return None
     # a structure that jumps with MV, or a poor minimum, may not know a fault that another one shows
     of = [ScoreTests(fit, each) for each in (best, *fit_structures(fit, UNDISTURBED, structures=(SECOND,)))]
-    likeliest: dict[str, tuple[Fitted, _Tried]] = {}
+    likeliest: dict[str, tuple[Fitted, _MvFit]] = {}
     for kind in _kinds(record, mv_at_rest):
         tried = [each for each in kind if _moves(each, record)]
         if not tried:
@@ -112,15 +112,15 @@ def find_mv_fault(fit: Fit[ExperimentRecord], best: Fitted, mv_at_rest: float) -
         return None
     found, fault = min(named.values(), key=lambda each: each[0].bic)
     others = [each.bic for kind, (each, _) in likeliest.items() if kind != fault.kind]
-    noise, least = EXPLAINED
-    explained = found.rms <= max(noise * record.noise / record.output_range, least)
+    noises, of_range = EXPLAINED
+    explained = found.rms <= max(noises * record.noise / record.output_range, of_range)
     gain = best.bic - found.bic
     if not explained or gain < MIN_BIC_GAIN or found.bic > min(others, default=math.inf) - RIVAL[fault.kind]:
         return None
     return MvFault(_in_words(fault, record), gain)
 
 
-def _kinds(record: ExperimentRecord, mv_at_rest: float) -> Iterator[Iterator[_Tried]]:
+def _kinds(record: ExperimentRecord, mv_at_rest: float) -> Iterator[Iterator[_MvFit]]:
     move = float(np.ptp(record.u))
     count = math.log(max(SLOWEST * record.period / FASTEST, 1.0)) / math.log(RATE_RATIO)
     slowest = move / (SLOWEST * record.period)
@@ -139,11 +139,11 @@ def _kinds(record: ExperimentRecord, mv_at_rest: float) -> Iterator[Iterator[_Tr
         yield (_other(record, name, share) for share in SHARES)
 
 
-def _refined(record: ExperimentRecord, mv_at_rest: float, some: Sequence[_Tried], many: int) -> tuple[Fitted, _Tried]:
+def _refined(record: ExperimentRecord, mv_at_rest: float, some: Sequence[_MvFit], many: int) -> tuple[Fitted, _MvFit]:
     """The best fit of one kind, and its size, refined from so many of these sizes."""
     thetas: dict[Structure, Reals] = {}
 
-    def fitted(each: _Tried, structures: Sequence[Structure] = (SECOND,)) -> Fitted:
+    def fitted(each: _MvFit, structures: Sequence[Structure] = (SECOND,)) -> Fitted:
         moved = Fit(replace(record, u=each.u))
         if structures[0] in thetas and len(structures) == 1:
             return moved.search(structures[0], UNDISTURBED, [thetas[structures[0]]], STEPS)
@@ -169,7 +169,7 @@ def _refined(record: ExperimentRecord, mv_at_rest: float, some: Sequence[_Tried]
     return (last if last.bic < found.bic else found), fault
 
 
-def _moves(tried: _Tried, record: ExperimentRecord) -> bool:
+def _moves(tried: _MvFit, record: ExperimentRecord) -> bool:
     """Whether the fault leaves something of MV's moves."""
     return float(np.max(np.abs(tried.u))) > LEFT * record.input_range
 
@@ -185,7 +185,7 @@ def _distinct(ranked: Sequence[int], apart: int) -> list[int]:
     return kept
 
 
-def _near(record: ExperimentRecord, mv_at_rest: float, fault: _Tried, finer: float) -> Iterator[_Tried]:
+def _near(record: ExperimentRecord, mv_at_rest: float, fault: _MvFit, finer: float) -> Iterator[_MvFit]:
     """Sizes near one."""
     if fault.kind == "rate":
         (rate,) = fault.size
@@ -207,15 +207,15 @@ def _near(record: ExperimentRecord, mv_at_rest: float, fault: _Tried, finer: flo
             yield from _window(record, mv_at_rest, length + more, begin + later)
 
 
-def _other(record: ExperimentRecord, name: str, size: float) -> _Tried:
+def _other(record: ExperimentRecord, name: str, size: float) -> _MvFit:
     """A fault of the valve of this size, a part of MV's largest move, or a gain that changes so much."""
     if name in OTHER_FAULTS:
         scale = record.input_range
-        return _Tried(name, (size,), scale * OTHER_FAULTS[name](record.u / scale, size))
-    return _Tried(name, (size,), record.u + size * OTHER_CHANGES[name](record))
+        return _MvFit(name, (size,), scale * OTHER_FAULTS[name](record.u / scale, size))
+    return _MvFit(name, (size,), record.u + size * OTHER_CHANGES[name](record))
 
 
-def _rate(record: ExperimentRecord, rate: float) -> _Tried:
+def _rate(record: ExperimentRecord, rate: float) -> _MvFit:
     """rate: MV units a sample. The mean over each sample of where such an actuator is."""
     at, found = float(record.u[0]), []
     for value in record.u.tolist():
@@ -223,24 +223,24 @@ def _rate(record: ExperimentRecord, rate: float) -> _Tried:
         # it arrives within the sample where the way is shorter than the rate
         found.append(at + way * (1.0 - 0.5 * abs(way) / rate))
         at += way
-    return _Tried("rate", (rate,), np.array(found))
+    return _MvFit("rate", (rate,), np.array(found))
 
 
-def _steps(record: ExperimentRecord, step: float, first: float) -> _Tried:
+def _steps(record: ExperimentRecord, step: float, first: float) -> _MvFit:
     """first: a level, MV units from rest."""
     u = step * np.round((record.u - first) / step)
-    return _Tried("steps", (step, first), np.asarray(u - np.mean(u[: record.listened])))
+    return _MvFit("steps", (step, first), np.asarray(u - np.mean(u[: record.listened])))
 
 
-def _window(record: ExperimentRecord, mv_at_rest: float, length: float, begin: float) -> Iterator[_Tried]:
+def _window(record: ExperimentRecord, mv_at_rest: float, length: float, begin: float) -> Iterator[_MvFit]:
     """length, begin: samples."""
     for latched in (True, False):
         mv = switched(record.u + mv_at_rest, length, begin, latched)
         if mv is not None:
-            yield _Tried("window", (length, begin), mv - mv_at_rest)
+            yield _MvFit("window", (length, begin), mv - mv_at_rest)
 
 
-def _in_words(fault: _Tried, record: ExperimentRecord) -> str:
+def _in_words(fault: _MvFit, record: ExperimentRecord) -> str:
     if fault.kind == "rate":
         rate = fault.size[0] / record.Ts
         asked, reached = float(np.max(np.abs(record.u))), float(np.max(np.abs(fault.u)))

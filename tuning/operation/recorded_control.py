@@ -85,7 +85,7 @@ def recorded_control(Ts: float, mv: Reals, pv: Reals, sp: Reals | None) -> Recor
     if sp is not None and _tracks(sp, pv):
         sp = None  # in manual the set-point may be made to follow PV
     moves = None if sp is None else int(np.count_nonzero(np.diff(sp)))
-    law = _Law(None) if _is_staircase(mv) else _gains(Ts, mv, pv, sp)
+    law = _FoundLaw(None) if _is_staircase(mv) else _gains(Ts, mv, pv, sp)
     if _is_staircase(mv):
         certain = _climbs_as_controlled(mv, pv, sp)
     else:
@@ -168,7 +168,7 @@ def _climbs_as_controlled(mv: Reals, pv: Reals, sp: Reals | None) -> bool:
     return left <= MAX_LEFT_OF_STAIRS and left <= MAX_LEFT_BY_INTEGRAL * without
 
 
-class _Law(NamedTuple):
+class _FoundLaw(NamedTuple):
     """The gains that MV's moves follow by, the part of their variance that these explain, and `weight_at_least`."""
 
     gains: Gains | None
@@ -176,15 +176,15 @@ class _Law(NamedTuple):
     weight_at_least: float | None = None
 
 
-def _gains(Ts: float, mv: Reals, pv: Reals, sp: Reals | None) -> _Law:
+def _gains(Ts: float, mv: Reals, pv: Reals, sp: Reals | None) -> _FoundLaw:
     """The gains that MV's moves follow by. Moves to a limit or from it are left out: they are what was left of what the
     controller asked for, and tell only the least that the set-point weight is."""
     if sp is None:
-        return _Law(None)
+        return _FoundLaw(None)
     moves, error, limited = np.diff(mv)[1:], (sp - pv)[1:-1], at_limit(mv)
     free = ~(limited[2:] | limited[1:-1])
     if np.count_nonzero(free) < FEWEST:
-        return _Law(None)
+        return _FoundLaw(None)
     columns, stepped = [-np.diff(pv)[1:], Ts * error], np.diff(sp)[1:]
     moved = bool(np.any(stepped[free]))
     if moved:
@@ -194,7 +194,7 @@ def _gains(Ts: float, mv: Reals, pv: Reals, sp: Reals | None) -> _Law:
     derivative = 1.0 - part > EXACT and 1.0 - with_derivative < CLEARLY_LESS * (1.0 - part)
     Kp, Ki = float(found[0]), float(found[1])
     if part < MIN_PART or derivative or Kp * Ki <= 0.0:
-        return _Law(None)
+        return _FoundLaw(None)
     at_least = None
     if moved:
         b = float(found[2] / Kp)
@@ -205,7 +205,7 @@ def _gains(Ts: float, mv: Reals, pv: Reals, sp: Reals | None) -> _Law:
         b = max(1.0, at_least)
     else:
         b = 1.0
-    return _Law(Gains(abs(Kp), Kp / Ki, b=0.0 if abs(b) < NO_WEIGHT else b), part, at_least)
+    return _FoundLaw(Gains(abs(Kp), Kp / Ki, b=0.0 if abs(b) < NO_WEIGHT else b), part, at_least)
 
 
 def _law(columns: list[Reals], moves: Reals) -> tuple[Reals, float]:

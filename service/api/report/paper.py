@@ -22,10 +22,10 @@ from loopwright.service.api.report.words import (
     stage_name,
     trust,
 )
-from loopwright.service.curves import LOAD_PCT, LoopCurves, horizons, loop_curves
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.jobs.design_curve import DesignCurve
 from loopwright.service.jobs.job_record import FITTED, JobRecord
+from loopwright.service.planning.curves import LOAD_PCT, LoopCurves, horizons, loop_curves
 from loopwright.service.results import GainsView, PerformanceView, StepPerformanceView, TransferModelView
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store.jobs import JobEvent

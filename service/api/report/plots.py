@@ -9,9 +9,9 @@ import numpy as np
 
 from loopwright.service.api.report.drawing import Label, Picture, around
 from loopwright.service.api.report.words import mark_names
-from loopwright.service.curves import LOAD_PCT, LoopCurves
 from loopwright.service.jobs.job_record import JobRecord
 from loopwright.service.listening.bins import GAP_BEFORE, Bins
+from loopwright.service.planning.curves import LOAD_PCT, LoopCurves
 from loopwright.tuning.models import Reals
 
 WIDTH = 690.0

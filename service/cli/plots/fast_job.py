@@ -15,8 +15,8 @@ from matplotlib.figure import Figure, SubFigure
 
 from loopwright.service.cli.plots import style
 from loopwright.service.cli.plots.shown import Shown
-from loopwright.service.curves import LOAD_PCT
 from loopwright.service.jobs.stored_record import StoredRecord
+from loopwright.service.planning.curves import LOAD_PCT
 from loopwright.service.results import EvidenceView
 from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.analysis.step_figures import StepFigures

@@ -376,7 +376,8 @@ class TestHttp:
 
     def test_the_last_model_is_known_and_no_dry_run_counts(self, service: Service, client: TestClient) -> None:
         assert self.ask(client)["known"]["model_job"] is None
-        jobs = [client.post(f"/loops/{TAG}/retune", json={"dry_run": dry}).json()["id"] for dry in (False, True)]
+        asked = [{"dry_run": dry, "requested_by": "me"} for dry in (False, True)]
+        jobs = [client.post(f"/loops/{TAG}/retune", json=each).json()["id"] for each in asked]
         for job in jobs:
             service.wait(job)
         service.tune.ends = Failed(Reason.NODE_LOST, "silent")

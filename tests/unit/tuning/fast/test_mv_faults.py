@@ -9,7 +9,7 @@ import pytest
 
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.plantsim.valves import Backlash, EqualPercentage, TwoGains
-from loopwright.tuning.analysis.window import swing_at_rest
+from loopwright.tuning.analysis.window import oscillation_at_rest
 from loopwright.tuning.fast.mv_faults import find_mv_fault
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.structure_choice import choose_structure
@@ -112,14 +112,14 @@ def test_other_plants_and_valves_are_not_told_to_be_one_of_these(actuator: Actua
 def test_a_window_that_swings_pv_at_rest_is_told_there(window: float) -> None:
     _, pv = moved(Window(window))
     rest = slice(LISTENED)
-    swing = swing_at_rest(pv[rest], mv()[rest], TS)
-    assert swing is not None and swing.by_window
-    assert float(swing.in_words.split("window of ")[1].split(" ")[0]) == pytest.approx(window, rel=0.02)
+    oscillation = oscillation_at_rest(pv[rest], mv()[rest], TS)
+    assert oscillation is not None and oscillation.by_window
+    assert float(oscillation.in_words.split("window of ")[1].split(" ")[0]) == pytest.approx(window, rel=0.02)
 
 
-def test_another_swing_at_rest_is_no_window_and_noise_is_none() -> None:
+def test_another_oscillation_at_rest_is_no_window_and_noise_is_none() -> None:
     t, random = TS * np.arange(200), np.random.default_rng(3)
     noise = NOISE * random.standard_normal(200)
-    swing = swing_at_rest(0.5 * np.sin(2.0 * np.pi * t / 9.0) + noise, np.full(200, REST), TS)
-    assert swing is not None and not swing.by_window and "9" in swing.in_words
-    assert swing_at_rest(noise, np.full(200, REST), TS) is None
+    oscillation = oscillation_at_rest(0.5 * np.sin(2.0 * np.pi * t / 9.0) + noise, np.full(200, REST), TS)
+    assert oscillation is not None and not oscillation.by_window and "9" in oscillation.in_words
+    assert oscillation_at_rest(noise, np.full(200, REST), TS) is None

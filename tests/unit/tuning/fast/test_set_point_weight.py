@@ -15,10 +15,10 @@ from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.design import MAX_OVERSHOOT, Aim, DesignSpec, GainDesign, aim_of
 from loopwright.tuning.fast.iae import LoopCost, LoopResponses
 from loopwright.tuning.fast.proposal import comparison_on
+from loopwright.tuning.fast.tuned import tune
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, TransferFunction, sign
 from loopwright.tuning.reasons import Reason, Refused
-from loopwright.tuning.tuned import tune
 from tests.unit.tuning.fast.records import BENCHES
 
 HEATER = FOPDT(0.8, 120.0, 15.0)

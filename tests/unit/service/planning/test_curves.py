@@ -15,9 +15,9 @@ from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.api.report.drawing import Picture
 from loopwright.service.api.report.plots import step_pictures
-from loopwright.service.curves import LOAD_PCT, LoopCurves, horizons, loop_curves
 from loopwright.service.jobs import design_curve as curve_of_designs
 from loopwright.service.jobs.alternatives import redesigned
+from loopwright.service.planning.curves import LOAD_PCT, LoopCurves, horizons, loop_curves
 from loopwright.service.results import FastResult, GainsView, TransferModelView
 from loopwright.service.states.job_state import JobState
 from loopwright.tuning.fast.design import DesignSpec
