@@ -67,6 +67,8 @@ def with_what_hides(refused: Refused, record: ExperimentRecord, pv: Reals, mv_at
     if step > COARSE * record.output_range and refused.reason is not Reason.STALLED:
         text = f"PV is rounded to {step:.3g}, and the test moved it by {record.output_range:.3g} only"
         return Refused(Reason.PV_ALTERED, text)
+    if not record.period:  # the test ended before the record had a time scale, which a fit needs
+        return refused
     fit = Fit(record)
     fault = find_mv_fault(fit, choose_structure(fit).best, mv_at_rest)
     if fault is not None:
