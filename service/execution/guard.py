@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 
 from loopwright.service.states.loop_state import LoopState
-from loopwright.tuning.experiments.false_pv import PvAtRest, PvWatch, check_end_of_rest
+from loopwright.tuning.experiments.false_pv import PvWatch
+from loopwright.tuning.experiments.pv_at_rest import PvAtRest, check_end_of_rest
 from loopwright.tuning.plan import Sample
 from loopwright.tuning.reasons import Failed, FalsePv, Reason
 
@@ -21,6 +22,7 @@ class RunLimits:
     max_gap_samples: number of samples in a row that may be missing.
     max_frozen_s: how long a PV of which nothing else is known may stay exactly constant while MV differs from its
     initial value, s of plant time; longer than any dead time.
+    sp_deviation: the permitted set-point step, PV units: no PV is rounded so coarsely.
     """
 
     pv_low: float = -math.inf
@@ -30,6 +32,7 @@ class RunLimits:
     max_time_s: float = math.inf
     max_gap_samples: int = 5
     max_frozen_s: float = math.inf
+    sp_deviation: float = math.inf
 
 
 class Guard:
@@ -57,6 +60,12 @@ class Guard:
         if not self._acting:
             self._acting = True
             check_end_of_rest(self._at_rest)
+
+    def check_end(self) -> None:
+        """Raises FalsePv where the run ends without a result on a PV that is still, or has jumped, as a true one would
+        not have had to."""
+        if self._watch is not None:
+            self._watch.check_end()
 
     def check(self, sample: Sample) -> None:
         """Raises Failed when the sample violates a limit; FalsePv where PV is false within its limits."""
@@ -86,7 +95,8 @@ class Guard:
             if self._watch is None:
                 state = self._state
                 rest, direction = PvAtRest.of(self._at_rest), 1.0 if state.reverse_acting else -1.0
-                self._watch = PvWatch(rest, self._mv_at_rest, direction, state.mv_low, state.mv_high)
+                step = self._limits.sp_deviation
+                self._watch = PvWatch(rest, self._mv_at_rest, direction, state.mv_low, state.mv_high, step)
                 self._at_rest.clear()
             self._watch.check(pv, mv)
         if pv != self._pv:

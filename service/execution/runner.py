@@ -100,11 +100,13 @@ class _Run(Generic[T]):
         self._result: RunResult[T] = RunResult()
         self._samples: list[Sample] = []
         self._home: LoopState | None = None
+        self._guard: Guard | None = None
         self._stage, self._since, self._now = "", 0.0, 0.0
 
     def to_the_end(self) -> RunResult[T]:
         self._until_something_ends_it()
         self._enter("")
+        self._doubt_pv()
         if self._home is not None:
             if isinstance(self._result.ended, FalsePv):
                 self._hold()
@@ -140,7 +142,7 @@ class _Run(Generic[T]):
 
     def _pump(self, home: LoopState) -> None:
         """Steps the loop until the plan, the guard, the loop or a stop request ends it, each by an exception."""
-        guard = Guard(self._limits, home)
+        guard = self._guard = Guard(self._limits, home)
         chunk = min(CHUNK, max(1, round(CHUNK_S / home.sample_time_s)))
         answer = next(self._plan)
         while True:
@@ -194,6 +196,18 @@ class _Run(Generic[T]):
 
     def _when(self) -> str:
         return f"at {self._now:.3f} s of plant time, in stage {self._stage or 'start'}"
+
+    def _doubt_pv(self) -> None:
+        """A test that ends without a result may have ended so by a PV that is false: the loop is not given back to
+        automatic on it. Where others have changed the loop, or it is not reached, it ends as that."""
+        ended = self._result.ended
+        others = isinstance(ended, Aborted) and ended.reason not in (Reason.OPERATOR, Reason.SERVICE_STOPPED)
+        if self._guard is None or ended is None or others or ended.reason in _UNREACHED or isinstance(ended, FalsePv):
+            return
+        try:
+            self._guard.check_end()
+        except FalsePv as false:
+            self._result.ended = FalsePv(false.reason, f"{false.detail} (without that: {ended})")
 
     def _hold(self) -> None:
         """Holds the loop at the MV before the test: no control law may answer a false PV."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.service.store.sample_blocks import COLUMNS, Block
+from loopwright.tuning.analysis.pv_faults import without_wrong_samples
 from loopwright.tuning.fast.manual_procedure import MANUAL
 from loopwright.tuning.fast.record import MIN_LISTENED, MIN_SWITCHES, Excitation, ExperimentRecord, oscillation_period
 from loopwright.tuning.fast.record_evaluation import first_period
@@ -53,7 +54,12 @@ class StoredRecord:
     @property
     def rest(self) -> tuple[float, float]:
         """Returns MV and PV at rest."""
-        return float(np.mean(self.mv[: self.listened])), float(np.mean(self.pv[: self.listened]))
+        return float(np.mean(self.mv[: self.listened])), float(np.mean(self.right_pv[: self.listened]))
+
+    @property
+    def right_pv(self) -> Reals:
+        """Returns PV without its single wrong samples, as the job took them out, in PV units."""
+        return without_wrong_samples(self.pv)
 
     def experiment_record(self) -> ExperimentRecord | None:
         """Returns the record for a fit; None where the relay has not switched often enough."""
@@ -61,7 +67,7 @@ class StoredRecord:
         if len(self.switches) < (MIN_SWITCHES if relay else MIN_TURNS) or self.listened < MIN_LISTENED:
             return None
         mv, pv = self.rest
-        u, y = self.mv - mv, self.pv - pv
+        u, y = self.mv - mv, self.right_pv - pv
         excited = slice(self.listened, self.excited)
         return ExperimentRecord(
             Ts=self.Ts,

@@ -26,8 +26,12 @@ OSCILLATES = 0.6
 """Part of the variance of PV at rest that one period has to make for PV to be said to swing."""
 MIN_WINDOWS = 4.0
 """Windows that the rest must hold to tell the length of one."""
-CLEARER = 30.0
-"""By how much chi-squared of a window has to be below that of a sine of the same length."""
+CLEARER, CLEARER_THAN_OTHERS = 30.0, 12.0
+"""By how much chi-squared of a window has to be below that of a sine of the same length, and below that of a window
+that is on for another part of it."""
+OTHER_PARTS, NOT_NEAR, PARTS_NEAR = np.linspace(0.08, 0.92, 15), 0.09, 3
+"""Parts of a window that are tried in place of that which MV says, how far they are from it, and with how many lengths
+on either side of the best one. A load that goes on and off by itself has a part of its own."""
 
 
 def switched(mv: Reals, length: float, begin: float, latched: bool) -> Reals | None:
@@ -36,7 +40,7 @@ def switched(mv: Reals, length: float, begin: float, latched: bool) -> Reals | N
     mv: absolute, MV units, shape (N,). length, begin: of the window, and where one begins, samples.
     latched: each window takes MV at its beginning; otherwise as it is.
     """
-    low, high = next(((a, b) for a, b in SPANS if a <= mv.min() and mv.max() <= b), (math.nan, math.nan))
+    low, high = _span(mv)
     if not low < high:
         return None
     n = np.arange(float(len(mv)))
@@ -50,6 +54,11 @@ def switched(mv: Reals, length: float, begin: float, latched: bool) -> Reals | N
         ends = starts + (on if k == 0 else further) * length
         found += np.clip(np.minimum(ends, n + 1.0) - np.maximum(starts, n), 0.0, 1.0)
     return np.asarray(low + (high - low) * found)
+
+
+def _span(mv: Reals) -> tuple[float, float]:
+    """What MV is when it is off, and on, all the time; not numbers where MV is beyond."""
+    return next(((a, b) for a, b in SPANS if a <= mv.min() and mv.max() <= b), (math.nan, math.nan))
 
 
 def lengths(rest: Reals, Ts: float, longest: float) -> list[float]:
@@ -99,10 +108,27 @@ def oscillation_at_rest(pv: Reals, mv: Reals, Ts: float) -> Oscillation | None:
     if of_sine > (1.0 - OSCILLATES) * variance and of_window > (1.0 - OSCILLATES) * variance:
         return None
     by = float(np.quantile(rest, 0.98) - np.quantile(rest, 0.02))
-    if (of_sine - of_window) / of_window * len(pv) > CLEARER:
-        text = f"MV is switched on and off in a window of {window * Ts:.3g} s, which swings PV by {by:.2g} at rest"
-        return Oscillation(True, text)
-    return Oscillation(False, f"PV swings by {by:.2g} at rest, with a period of {length * Ts:.3g} s")
+    swings = Oscillation(False, f"PV swings by {by:.2g} at rest, with a period of {length * Ts:.3g} s")
+    if not math.isfinite(of_window):
+        return swings
+    at = near.index(window)
+    some = near[max(at - PARTS_NEAR, 0) : at + PARTS_NEAR + 1]
+    if (of_sine - of_window) / of_window * len(rest) < CLEARER or not _of_this_part(rest, mv, some, trend, of_window):
+        return swings
+    text = f"PV swings by {by:.2g} at rest, as by an MV that is switched on and off in a window of {window * Ts:.3g} s"
+    return Oscillation(True, text)
+
+
+def _of_this_part(rest: Reals, mv: Reals, near: list[float], trend: Reals, left: float) -> bool:
+    """Whether a wave that is on for another part of a window than MV says leaves clearly more of PV at rest."""
+    low, high = _span(mv)
+    mean = float(mv.mean())
+    part = (mean - low) / (high - low)
+    # on and off changed for each other are the same wave
+    others = [each for each in OTHER_PARTS if min(abs(each - part), abs(1.0 - each - part)) > NOT_NEAR]
+    shifted = (np.clip(mv - mean + low + each * (high - low), low, high) for each in others)
+    best, _ = min(each for other in shifted for each in _by_windows(rest, other, near, trend))
+    return (best - left) / left * len(rest) > CLEARER_THAN_OTHERS
 
 
 def _by_windows(rest: Reals, mv: Reals, near: list[float], trend: Reals) -> Iterator[tuple[float, float]]:

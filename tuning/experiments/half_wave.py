@@ -10,8 +10,8 @@ import numpy as np
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint
 from loopwright.tuning.reasons import Reason, Refused
 
-AVERAGED = 3
-"""Number of samples whose mean tells where PV is."""
+LOOKED_AT, MEDIAN_ERROR = 7, 0.5
+"""Number of samples whose median tells where PV is, in spite of three wrong ones, and its error in noises."""
 BAND_NOISES = 5.0
 """The band around rest, in noises, where the relay's hysteresis is narrower."""
 MOVED_NOISES = 5.0
@@ -66,7 +66,7 @@ class HalfWaves:
 
     def __init__(self, facts: Facts, point: OperatingPoint, noise: float, hysteresis: float) -> None:
         self._facts, self._rest, self._noise = facts, point.pv, noise
-        self._band = max(hysteresis, BAND_NOISES * noise / math.sqrt(AVERAGED))
+        self._band = max(hysteresis, BAND_NOISES * noise * MEDIAN_ERROR)
         self._last: list[float] = []
         self._samples = 0
         self._delay = 0
@@ -90,10 +90,10 @@ class HalfWaves:
         up: whether MV drives PV up, if the controller's action is right.
         """
         self._samples += 1
-        self._last = [*self._last[-AVERAGED + 1 :], pv]
-        if len(self._last) < AVERAGED:
+        self._last = [*self._last[-LOOKED_AT + 1 :], pv]
+        if len(self._last) < LOOKED_AT:
             return False
-        deviation = sum(self._last) / AVERAGED - self._rest
+        deviation = sorted(self._last)[LOOKED_AT // 2] - self._rest
         if not self._delay and abs(deviation) > self._band:
             self._delay = self._samples
         wrong = -deviation if up else deviation
@@ -115,7 +115,7 @@ class HalfWaves:
         )
 
     def _turned(self) -> float:
-        return max(TURNED_NOISES * self._noise / math.sqrt(AVERAGED), TURNED_PART * self._farthest)
+        return max(TURNED_NOISES * self._noise * MEDIAN_ERROR, TURNED_PART * self._farthest)
 
     def _too_long(self, away: int) -> bool:
         facts = self._facts

@@ -69,7 +69,8 @@ def at_rest(
     try:
         return (yield from check_at_rest(facts, min_samples, mode, heard))
     except Refused as refused:
-        if refused.reason is not Reason.NOT_AT_REST or mode is not Mode.AUTOMATIC:
+        # a sticking valve cycles more slowly than what swings PV several times in one look
+        if refused.reason is not Reason.NOT_AT_REST or mode is not Mode.AUTOMATIC or isinstance(refused, _Swinging):
             raise
         cause = yield from worked(partial(find_sticking, facts.sample_time_s, *map(np.asarray, (heard.mv, heard.pv))))
         if cause is None:
@@ -142,4 +143,8 @@ def _named(reason: Reason, text: str, trace: Trace, facts: Facts) -> Refused:
         return Refused(reason, f"{wrong}, where the noise is {without:.2g} without them: {text}")
     if (oscillation := oscillation_at_rest(pv, np.asarray(trace.mv), facts.sample_time_s)) is None:
         return Refused(reason, text)
-    return Refused(Reason.MV_ALTERED if oscillation.by_window else reason, f"{oscillation.in_words}: {text}")
+    return _Swinging(Reason.MV_ALTERED if oscillation.by_window else reason, f"{oscillation.in_words}: {text}")
+
+
+class _Swinging(Refused):
+    """Something swings PV several times in one look."""

@@ -21,7 +21,7 @@ from loopwright.tuning.fast.proposal import FastProposal, comparison_of, evaluat
 from loopwright.tuning.fast.record import MIN_LISTENED
 from loopwright.tuning.fast.record_evaluation import first_period
 from loopwright.tuning.fast.still_open import OPEN_REASONS
-from loopwright.tuning.fast.what_hides import naming_what_hides
+from loopwright.tuning.fast.what_hides import naming_what_hides, while_open
 from loopwright.tuning.plan import Mode, Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -89,7 +89,7 @@ def _pulsed(facts: Facts, options: DesignOptions, method: str, test: ManualTest)
             if settled(look, last, looked_at, MAX_DISAGREEMENT):
                 break
             if look.refusal is not None:
-                yield from test.report(Note(f"after {looked_at} samples: {look.refusal.detail}"))
+                yield from test.report(Note(f"after {looked_at} samples: {while_open(test, look.refusal)}"))
             lasting = look.refusal is not None and look.refusal.reason not in OPEN_REASONS
             objections = objections + 1 if lasting else 0
             if objections == MAX_OBJECTIONS:

@@ -16,6 +16,7 @@ import numpy as np
 from loopwright.tuning.analysis.window import PHASES, lengths, switched
 from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.fast.score_tests import ScoreTests, above_rest, cubed, squared
+from loopwright.tuning.fast.two_lags import find_two_lags
 from loopwright.tuning.fast.valve_faults import Fault, backlash, saturation, stiction
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN, by_bic, fit_structures
 from loopwright.tuning.identification.output_error import UNDISTURBED, Fit, Fitted
@@ -116,6 +117,10 @@ def find_mv_fault(fit: Fit[ExperimentRecord], best: Fitted, mv_at_rest: float) -
     explained = found.rms <= max(noises * record.noise / record.output_range, of_range)
     gain = best.bic - found.bic
     if not explained or gain < MIN_BIC_GAIN or found.bic > min(others, default=math.inf) - RIVAL[fault.kind]:
+        return None
+    # a lag that is another one while PV falls is named by the evaluation, before this
+    lags = find_two_lags(fit, best)
+    if lags is not None and lags.bic_gain > gain - RIVAL[fault.kind]:
         return None
     return MvFault(_in_words(fault, record), gain)
 

@@ -33,7 +33,7 @@ from loopwright.tuning.fast.proposal import (
 from loopwright.tuning.fast.record import MIN_LISTENED
 from loopwright.tuning.fast.relay_test import RelayTest
 from loopwright.tuning.fast.still_open import OPEN_REASONS, open_by, trial_may_tell
-from loopwright.tuning.fast.what_hides import naming_what_hides
+from loopwright.tuning.fast.what_hides import naming_what_hides, while_open
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -133,7 +133,7 @@ def _by_relay(facts: Facts, options: FastOptions, experiment: RelayTest) -> Plan
             outcome = refused
         if isinstance(outcome, Comparison) or not in_time or outcome.reason in ENDING:
             break
-        yield from experiment.report(Note(f"after {switches} switches: {outcome.detail}"))
+        yield from experiment.report(Note(f"after {switches} switches: {while_open(experiment, outcome)}"))
     open_still = outcome if isinstance(outcome, Refused) else None
     if options.verify and evaluation is not None and open_still and trial_may_tell(evaluation, open_still):
         known = f"Ms of the new gains is known to +{open_by(evaluation):.2g}"
@@ -159,7 +159,8 @@ def _by_relay(facts: Facts, options: FastOptions, experiment: RelayTest) -> Plan
         evaluation, outcome = yield from experiment.computed(evaluating)
         shown = verified_step(evaluation, tested, *experiment.stepped)
         if isinstance(outcome, Refused) and outcome.reason in OPEN_REASONS:
-            yield from experiment.report(Note(f"after the set-point step: {outcome.detail}; it is stepped back"))
+            text = while_open(experiment, outcome)
+            yield from experiment.report(Note(f"after the set-point step: {text}; it is stepped back"))
             yield from experiment.step_back()
             evaluating = partial(evaluated, facts, options, experiment.experiment_record(), first)
             evaluation, outcome = yield from experiment.computed(evaluating)

@@ -19,6 +19,7 @@ from loopwright.tuning.fast.pulse_test import BACK, DOWN, UP, PulseTest
 from loopwright.tuning.fast.pulse_test import MAX_T95 as MAX_T95_TO_FOLLOW
 from loopwright.tuning.fast.record_evaluation import first_period
 from loopwright.tuning.fast.still_open import OPEN_REASONS, open_by, samples_needed, trial_may_tell
+from loopwright.tuning.fast.what_hides import while_open
 from loopwright.tuning.models import Model
 from loopwright.tuning.plan import Note, Plan
 from loopwright.tuning.reasons import Reason, Refused
@@ -89,7 +90,7 @@ def pulsed(test: PulseTest, options: DesignOptions, relay_follows: bool) -> Plan
         if look.refusal is not None:
             if relay_follows and _relay_is_shorter(look, samples):
                 raise TooLittleExcited(look.refusal, test)
-            yield from test.report(Note(f"after {samples} samples: {look.refusal.detail}"))
+            yield from test.report(Note(f"after {samples} samples: {while_open(test, look.refusal)}"))
         looks += 1
         growth = NEXT_LOOK if looks < LOOKS_OFTEN else LATER_LOOK
         at = min(growth * samples + NEXT_LOOK_PERIODS * own, longest)

@@ -27,7 +27,7 @@ from loopwright.tuning.fast.pulse_test import PulseTest
 from loopwright.tuning.fast.pulses import TooLittleExcited, pulsed
 from loopwright.tuning.fast.record import MIN_LISTENED
 from loopwright.tuning.fast.still_open import OPEN_REASONS
-from loopwright.tuning.fast.what_hides import naming_what_hides
+from loopwright.tuning.fast.what_hides import naming_what_hides, while_open
 from loopwright.tuning.plan import Note, Plan, StageDone, StageStarted
 from loopwright.tuning.reasons import Refused
 
@@ -111,7 +111,7 @@ def _tested(
         )
         shown = verified_step(evaluation, tested, *test.stepped)
         if isinstance(outcome, Refused) and outcome.reason in OPEN_REASONS:
-            yield from test.report(Note(f"after the set-point step: {outcome.detail}; it is stepped again"))
+            yield from test.report(Note(f"after the set-point step: {while_open(test, outcome)}; it is stepped again"))
             yield from test.step_again()
             evaluation, outcome = yield from test.computed(
                 partial(evaluated, facts, options, test.experiment_record(), first)

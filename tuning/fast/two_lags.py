@@ -43,11 +43,12 @@ MIN_RATIO = 1.1
 class TwoLags:
     """A plant that rises with another lag than it falls.
 
-    rises_s, falls_s: its lags, s.
+    rises_s, falls_s: its lags, s. bic_gain: by how much it lowers BIC below the best linear model.
     """
 
     rises_s: float
     falls_s: float
+    bic_gain: float
 
     @property
     def what(self) -> str:
@@ -90,7 +91,7 @@ def find_two_lags(fit: Fit[ExperimentRecord], best: Fitted) -> TwoLags | None:
     others = fit_changing_gains(fit, replace(best, hypothesis=UNDISTURBED))
     if any(each.bic_gain > found.bic_gain - MIN_BIC_GAIN for each in others):
         return None
-    return TwoLags(rises_s, falls_s)
+    return TwoLags(rises_s, falls_s, found.bic_gain)
 
 
 def _answers(u: Reals, at: Reals, block: int) -> Reals:

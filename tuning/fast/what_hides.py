@@ -50,6 +50,12 @@ def naming_what_hides(test: Experiment, plan: Callable[[], Plan[T]]) -> Plan[T]:
         raise (yield from test.computed(partial(with_what_hides, refused, record, pv, mv_at_rest))) from None
 
 
+def while_open(test: Experiment, refused: Refused) -> str:
+    """What is said of a record while its test goes on: what hides in PV, and of the plant only where nothing does."""
+    named = of_pv(np.asarray(test.trace.pv), test.facts.sample_time_s)
+    return refused.detail if named is None or refused.reason not in OF_THE_RECORD else named
+
+
 def with_what_hides(refused: Refused, record: ExperimentRecord, pv: Reals, mv_at_rest: float) -> Refused:
     """The refusal of a record, which names what hides in its PV or its MV.
 
@@ -61,6 +67,8 @@ def with_what_hides(refused: Refused, record: ExperimentRecord, pv: Reals, mv_at
     if step > COARSE * record.output_range and refused.reason is not Reason.STALLED:
         text = f"PV is rounded to {step:.3g}, and the test moved it by {record.output_range:.3g} only"
         return Refused(Reason.PV_ALTERED, text)
+    if not record.period:  # the test ended before the record had a time scale, which a fit needs
+        return refused
     fit = Fit(record)
     fault = find_mv_fault(fit, choose_structure(fit).best, mv_at_rest)
     if fault is not None:

@@ -65,6 +65,19 @@ def test_the_same_model_comes_out_of_it_again(
     assert abs(model.L - 2.0) < 0.05
 
 
+def test_single_wrong_samples_are_taken_out_again(job: tuple[dict[str, Any], dict[str, list[Any]]]) -> None:
+    _, columns = job
+    pv = list(columns["pv"])
+    for k in range(7, len(pv) - 20, 83):
+        pv[k] += 0.4 if k % 2 else -0.4
+    whole, spoilt = stored_record(columns), stored_record(columns | {"pv": pv})
+    assert whole is not None and spoilt is not None
+    right, again = whole.experiment_record(), spoilt.experiment_record()
+    assert right is not None and again is not None
+    assert np.max(np.abs(spoilt.pv - whole.pv)) == pytest.approx(0.4)
+    assert np.max(np.abs(again.y - right.y)) < 0.05
+
+
 def test_the_last_attempt_counts(job: tuple[dict[str, Any], dict[str, list[Any]]]) -> None:
     columns = job[1]
     half = len(columns["t_s"]) // 2
