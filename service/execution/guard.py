@@ -61,6 +61,19 @@ class Guard:
             self._acting = True
             check_end_of_rest(self._at_rest)
 
+    def look_on(self, sample: Sample) -> bool:
+        """Takes one more sample after the end, where PV may have jumped; whether it is to be looked at further.
+        Raises FalsePv."""
+        if self._watch is None or not (math.isfinite(sample.pv) and math.isfinite(sample.mv)):
+            return False
+        self._watch.check(sample.pv, sample.mv)
+        return self._watch.undecided
+
+    @property
+    def undecided(self) -> bool:
+        """Whether PV has just jumped, and may be false."""
+        return self._watch is not None and self._watch.undecided
+
     def check_end(self) -> None:
         """Raises FalsePv where the run ends without a result on a PV that is still, or has jumped, as a true one would
         not have had to."""
@@ -70,7 +83,7 @@ class Guard:
     def check(self, sample: Sample) -> None:
         """Raises Failed when the sample violates a limit; FalsePv where PV is false within its limits."""
         t, _, pv, mv, _ = sample
-        limits = self._limits
+        limits, acting = self._limits, self._acting
         if not (math.isfinite(pv) and math.isfinite(mv)):
             raise Failed(Reason.BAD_SAMPLE, f"at {t:.3f} s PV is {pv}, MV is {mv}")
         if self._start is None:
@@ -79,8 +92,10 @@ class Guard:
             raise Failed(Reason.SAMPLES_LOST, f"{(t - self._last) / self._dt - 1:.0f} samples missing before {t:.3f} s")
         self._last = t
         if not limits.pv_low <= pv <= limits.pv_high:
+            if acting and self._watch is not None:
+                self._watch.check(pv, mv)
             raise Failed(Reason.PV_LIMIT, f"PV {pv:.5g} left {limits.pv_low:.5g} .. {limits.pv_high:.5g} at {t:.3f} s")
-        if self._acting and not limits.mv_low - self._slack <= mv <= limits.mv_high + self._slack:
+        if acting and not limits.mv_low - self._slack <= mv <= limits.mv_high + self._slack:
             raise Failed(Reason.MV_LIMIT, f"MV {mv:.5g} left {limits.mv_low:.5g} .. {limits.mv_high:.5g} at {t:.3f} s")
         if t - self._start > limits.max_time_s:
             raise Failed(Reason.TIME_BUDGET, f"{t - self._start:.0f} s of plant time are over the budget")

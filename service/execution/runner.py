@@ -17,6 +17,7 @@ from loopwright.service.states.loop_state import LoopState, after_false_pv
 from loopwright.tuning.plan import (
     Command,
     Event,
+    Mode,
     Note,
     Plan,
     Sample,
@@ -205,9 +206,24 @@ class _Run(Generic[T]):
         if self._guard is None or ended is None or others or ended.reason in _UNREACHED or isinstance(ended, FalsePv):
             return
         try:
+            self._look_on(self._guard)
             self._guard.check_end()
         except FalsePv as false:
             self._result.ended = FalsePv(false.reason, f"{false.detail} (without that: {ended})")
+
+    def _look_on(self, guard: Guard) -> None:
+        """Looks at a few more samples with MV as it was before the test, where PV has just jumped: whether it stays.
+        Raises FalsePv."""
+        commands: list[Command] = [SetMode(Mode.MANUAL), SetOutput(self._home.mv)] if self._home is not None else []
+        looks = guard.undecided
+        while looks:
+            try:
+                sample = self._loop.step(commands)
+            except Ended as ended:
+                self._on_event(Note(f"PV could not be looked at any longer: {ended}"))
+                return
+            self._samples.append(sample)
+            commands, looks = [], guard.look_on(sample)
 
     def _hold(self) -> None:
         """Holds the loop at the MV before the test: no control law may answer a false PV."""

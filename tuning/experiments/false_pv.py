@@ -26,15 +26,15 @@ from loopwright.tuning.experiments.pv_at_rest import LOUD_WINDOW, RUN_OF_REST, W
 from loopwright.tuning.experiments.pv_jump import JumpWatch
 from loopwright.tuning.reasons import FalsePv, Reason
 
-LOUD = {15: (4.5, 2.8), 20: (4.0, 2.5), 26: (3.5, 2.3)}
+LOUD = {12: (4.5, 3.0), 15: (3.2, 2.5), 20: (2.7, 2.2), 26: (2.5, 2.0)}
 """PV is too loud where, over so many values, the mean square of what does not lie between its neighbours exceeds this
 multiple of the variance at rest, without the OUTLIERS_BETWEEN largest (which a jump, or a wrong sample, makes), and
-that of the distance from the median the second one, without the OUTLIERS farthest. Of white noise the first is met by
-chance once in 1e5, whatever way PV moves."""
+that of the distance from the median the second one, without the OUTLIERS farthest. White noise meets the second one by
+chance once in 1e8; the first one, once in 1e4 or less whatever way PV moves."""
 OUTLIERS_BETWEEN, OUTLIERS = 4, 3
 MOST_SELDOM = 4
 """Number of samples from one value to the next from which on the way of PV may look like noise."""
-WHITE = 0.6
+WHITE = 0.5
 """Smallest ratio of von Neumann of noise around a PV that stands still, without the two largest differences; it is far
 smaller where PV moves."""
 QUIET_MORE, LARGE_MOVE = 15, 0.3
@@ -83,6 +83,8 @@ class PvWatch:
         """The last move of MV that PV has to answer: MV after it, and its sample."""
         self._answer_due: int | None = None
         """The first such move since PV is equal."""
+        self._unanswered: int | None = None
+        """The first large move of MV since then, whether or not PV has to show it."""
         self._changes: deque[tuple[float, int]] = deque(maxlen=STEADY_CHANGES)
         """The last moves of PV, and the number of samples for which it was equal before each."""
         length = max(WINDOWS) + 1
@@ -105,6 +107,11 @@ class PvWatch:
         self._jumps.check(pv, mv, self._renewal())
         self._last = pv
 
+    @property
+    def undecided(self) -> bool:
+        """Whether a few more samples tell whether PV is false."""
+        return self._jumps.undecided
+
     def check_end(self) -> None:
         """Looks at PV once more where the test ends without a result. Raises FalsePv: PV_FROZEN, BAD_SAMPLE.
 
@@ -112,12 +119,13 @@ class PvWatch:
         false while it goes on.
         """
         self._jumps.check_end()
-        if self._rest.lively or self._answer_due is None:
+        due = self._unanswered if len(self._changes) < STEADY_CHANGES else self._answer_due
+        if self._rest.lively or due is None:
             return
-        since = self._n - self._answer_due
+        since = self._n - due
         if since > RUN_OF_REST * (self._longest_run if self._changes else self._rest.samples) + QUIET_MORE:
             ever = "" if self._changes else ", as it was before the test,"
-            text = f"PV is exactly {self._last:.6g}{ever} for {since} samples since MV moved to {self._moved_mv[0]:.4g}"
+            text = f"PV is exactly {self._last:.6g}{ever} for {since} samples since MV moved"
             raise FalsePv(Reason.PV_FROZEN, f"{text}: the sensor has ended, or MV moves nothing")
 
     def _renewal(self) -> int | None:
@@ -142,7 +150,10 @@ class PvWatch:
         self._farthest_mv = max(self._farthest_mv, abs(mv - self._mv_home))
         self._off_home = self._off_home + 1 if abs(mv - self._mv_home) > self._hair else 0
         move = abs(mv - self._moved_mv[0])
-        if move > max(LARGE_MOVE * self._farthest_mv, self._hair) and self.has_to_show(move):
+        large = move > max(LARGE_MOVE * self._farthest_mv, self._hair)
+        if large and self._unanswered is None:
+            self._unanswered = self._n
+        if large and self.has_to_show(move):
             self._moved_mv = (mv, self._n)
             if self._answer_due is None:
                 self._answer_due = self._n
@@ -153,7 +164,7 @@ class PvWatch:
             self._changes.append((pv - self._last, self._run))
             self._learn_quantum(abs(pv - self._last))
             self._farthest_pv = max(self._farthest_pv, abs(pv - self._rest.value))
-        self._run, self._answer_due = 1, None
+        self._run, self._answer_due, self._unanswered = 1, None, None
 
     def _learn_quantum(self, move: float) -> None:
         self._least_change = min(self._least_change, move)

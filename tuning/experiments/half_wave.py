@@ -10,8 +10,11 @@ import numpy as np
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint
 from loopwright.tuning.reasons import Reason, Refused
 
-LOOKED_AT, MEDIAN_ERROR = 7, 0.5
-"""Number of samples whose median tells where PV is, in spite of three wrong ones, and its error in noises."""
+AVERAGED = 3
+"""Number of samples whose mean tells where PV is."""
+JUMPED, PASSED_OVER = 0.5, 6
+"""After a move within a sample of more than the band and this part of all its way, which wrong samples make, so many
+samples are passed over."""
 BAND_NOISES = 5.0
 """The band around rest, in noises, where the relay's hysteresis is narrower."""
 MOVED_NOISES = 5.0
@@ -66,8 +69,9 @@ class HalfWaves:
 
     def __init__(self, facts: Facts, point: OperatingPoint, noise: float, hysteresis: float) -> None:
         self._facts, self._rest, self._noise = facts, point.pv, noise
-        self._band = max(hysteresis, BAND_NOISES * noise * MEDIAN_ERROR)
+        self._band = max(hysteresis, BAND_NOISES * noise / math.sqrt(AVERAGED))
         self._last: list[float] = []
+        self._passed_over = 0
         self._samples = 0
         self._delay = 0
         """The number of samples until PV first left its band; 0 where it has not."""
@@ -90,10 +94,17 @@ class HalfWaves:
         up: whether MV drives PV up, if the controller's action is right.
         """
         self._samples += 1
-        self._last = [*self._last[-LOOKED_AT + 1 :], pv]
-        if len(self._last) < LOOKED_AT:
+        if self._passed_over:
+            self._passed_over -= 1
             return False
-        deviation = sorted(self._last)[LOOKED_AT // 2] - self._rest
+        if self._last and abs(pv - self._last[-1]) > max(self._band, JUMPED * self._farthest):
+            self._passed_over = PASSED_OVER - 1
+            self._last.clear()
+            return False
+        self._last = [*self._last[-AVERAGED + 1 :], pv]
+        if len(self._last) < AVERAGED:
+            return False
+        deviation = sum(self._last) / AVERAGED - self._rest
         if not self._delay and abs(deviation) > self._band:
             self._delay = self._samples
         wrong = -deviation if up else deviation
@@ -115,7 +126,7 @@ class HalfWaves:
         )
 
     def _turned(self) -> float:
-        return max(TURNED_NOISES * self._noise * MEDIAN_ERROR, TURNED_PART * self._farthest)
+        return max(TURNED_NOISES * self._noise / math.sqrt(AVERAGED), TURNED_PART * self._farthest)
 
     def _too_long(self, away: int) -> bool:
         facts = self._facts

@@ -99,6 +99,12 @@ class JumpWatch:
         """Whether PV has jumped, and it is not known yet whether it stays."""
         return self._jump is not None
 
+    @property
+    def undecided(self) -> bool:
+        """Whether PV has jumped so few samples ago that they may be wrong ones, or so that the plant may have."""
+        jump = self._jump
+        return self._claim is not None or (jump is not None and (jump.since < JUMP_STAYS or jump.delay is not None))
+
     def check(self, pv: float, mv: float, renewal: int | None) -> None:
         """Takes the next sample. Raises FalsePv, BAD_SAMPLE.
 
