@@ -43,7 +43,7 @@ APART = {"steps": 3, "window": 4}
 LEFT = 0.05
 """Smallest part of MV's largest move that a fault leaves."""
 BEGUN = 3
-"""How many sizes of a kind that is named are refined."""
+"""How many sizes of a kind that is named are refined; of another kind the best one is."""
 CLEAR = 4.0
 """By how much a fault has to lower chi-squared in a score test to be fitted."""
 FITTED, REFINED = 8, 6
@@ -92,32 +92,22 @@ def find_mv_fault(fit: Fit[ExperimentRecord], best: Fitted, mv_at_rest: float) -
         return None
     # a structure that jumps with MV, or a poor minimum, may not know a fault that another one shows
     of = [ScoreTests(fit, each) for each in (best, *fit_structures(fit, UNDISTURBED, structures=(SECOND,)))]
-    likeliest: dict[str, tuple[Fitted, _MvFit]] = {}
-    for kind in _kinds(record, mv_at_rest):
-        tried = [each for each in kind if _moves(each, record)]
-        if not tried:
-            continue
-        changed = np.array([each.u for each in tried]) - record.u
-        scored = (tests.scores(changed) for tests in of)
-        decrease = np.max([(2.0 * shares - 1.0) / np.square(deviations) for shares, deviations in scored], axis=0)
-        ranked = np.argsort(-decrease).tolist()
-        if not decrease[ranked[0]] > CLEAR:
-            continue
-        name = tried[0].kind
-        some = [tried[i] for i in _distinct(ranked, APART.get(name, 1))]
-        # the score test of a large fault says little of its size
-        some += tried[::3] if name == "rate" else []
-        likeliest[name] = _refined(record, mv_at_rest, some, BEGUN if name in RIVAL else 1)
-    named = {kind: each for kind, each in likeliest.items() if kind in RIVAL}
+    named = [
+        _refined(record, mv_at_rest, some, BEGUN)
+        for kind in _kinds(record, mv_at_rest)
+        if (some := _likely(of, record, kind))
+    ]
     if not named:
         return None
-    found, fault = min(named.values(), key=lambda each: each[0].bic)
-    others = [each.bic for kind, (each, _) in likeliest.items() if kind != fault.kind]
+    (found, fault), *others = sorted(named, key=lambda each: each[0].bic)
     noises, of_range = EXPLAINED
     explained = found.rms <= max(noises * record.noise / record.output_range, of_range)
-    gain = best.bic - found.bic
-    if not explained or gain < MIN_BIC_GAIN or found.bic > min(others, default=math.inf) - RIVAL[fault.kind]:
+    gain, clear = best.bic - found.bic, found.bic + RIVAL[fault.kind]
+    if not explained or gain < MIN_BIC_GAIN or any(each.bic < clear for each, _ in others):
         return None
+    for kind in _other_kinds(record):
+        if (some := _likely(of, record, kind)) and _refined(record, mv_at_rest, some, 1)[0].bic < clear:
+            return None
     # a lag that is another one while PV falls is named by the evaluation, before this
     lags = find_two_lags(fit, best)
     if lags is not None and lags.bic_gain > gain - RIVAL[fault.kind]:
@@ -125,7 +115,25 @@ def find_mv_fault(fit: Fit[ExperimentRecord], best: Fitted, mv_at_rest: float) -
     return MvFault(_in_words(fault, record), gain)
 
 
+def _likely(of: Sequence[ScoreTests], record: ExperimentRecord, kind: Iterator[_MvFit]) -> list[_MvFit]:
+    """The sizes of one kind that score tests of these models find the likeliest; none where none is likely."""
+    tried = [each for each in kind if _moves(each, record)]
+    if not tried:
+        return []
+    changed = np.array([each.u for each in tried]) - record.u
+    scored = (tests.scores(changed) for tests in of)
+    decrease = np.max([(2.0 * shares - 1.0) / np.square(deviations) for shares, deviations in scored], axis=0)
+    ranked = np.argsort(-decrease).tolist()
+    if not decrease[ranked[0]] > CLEAR:
+        return []
+    name = tried[0].kind
+    some = [tried[i] for i in _distinct(ranked, APART.get(name, 1))]
+    # the score test of a large fault says little of its size
+    return some + (tried[::3] if name == "rate" else [])
+
+
 def _kinds(record: ExperimentRecord, mv_at_rest: float) -> Iterator[Iterator[_MvFit]]:
+    """Every size of each kind that is named."""
     move = float(np.ptp(record.u))
     count = math.log(max(SLOWEST * record.period / FASTEST, 1.0)) / math.log(RATE_RATIO)
     slowest = move / (SLOWEST * record.period)
@@ -138,6 +146,10 @@ def _kinds(record: ExperimentRecord, mv_at_rest: float) -> Iterator[Iterator[_Mv
         for k in range(PHASES)
         for each in _window(record, mv_at_rest, length, length * k / PHASES)
     )
+
+
+def _other_kinds(record: ExperimentRecord) -> Iterator[Iterator[_MvFit]]:
+    """Every size of each kind that is not named here."""
     for name in OTHER_FAULTS:
         yield (_other(record, name, size) for size in SIZES)
     for name in OTHER_CHANGES:
