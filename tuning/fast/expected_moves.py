@@ -31,8 +31,8 @@ GAIN_SEEN_BY_PULSES, GAIN_SEEN_IN_MANUAL = 0.85, 0.9
 """The gain that a test may take the plant to have as it sizes its later moves, over what it is: the first response
 shows it to 10 or 20 %."""
 LAST_LEVEL_TURNS = (2.0, 0.0, 0.3, 0.7)
-"""How long the last level of the set-point is held, in times of the two turns before it. After the longest PV's swing is
-over. The pulses end as soon as the record tells enough, and the step under the new gains may begin anywhere in that
+"""How long the last level of the set-point is held, in times of the two turns before it. After the longest PV's swing
+is over. The pulses end as soon as the record tells enough, and the step under the new gains may begin anywhere in that
 swing, which adds to it: the others are such moments."""
 
 
@@ -96,9 +96,7 @@ def expected_moves(
                 return (yield from _relay(relay, new))
             pulses = PulseTest(facts, point, trace)
             yield from _pulses(pulses, _seen(model, GAIN_SEEN_BY_PULSES), last_level_turns)
-            relay = RelayTest(
-                facts, point, pulses.trace, options.amplitude, pulses.listened, options.begins_with
-            )
+            relay = RelayTest(facts, point, pulses.trace, options.amplitude, pulses.listened, options.begins_with)
             return (yield from _relay(relay, new))
 
 
