@@ -20,8 +20,8 @@ SIZES = (0.03, 0.06, 0.11, 0.19, 0.31)  # of MV's largest move
 SIZES_OF_STICTION = (0.01, 0.014, 0.02, 0.028, *SIZES[1:], 0.04, 0.085, 0.15)
 """Those of stiction: a level goes on moving for as long as the valve stands a little off."""
 SMALL_STICTION, MIN_BIC_GAIN_OF_SMALL = 0.04, 30.0
-"""The stiction, as a fraction of the largest deviation of MV, up to which the valve must lower BIC by more: a plant that
-is none of the structures looks a little like it."""
+"""The stiction, as a fraction of the largest deviation of MV, below which it must lower BIC by more: a plant that is
+none of the structures looks a little like it."""
 SATURATIONS, MAX_SATURATION = (0.55, 0.7, 0.85), 0.96
 FIRST_STEPS, STEPS = 4, 10
 REFINED = (1.25, 1.1, 1.04)
