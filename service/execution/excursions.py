@@ -197,8 +197,8 @@ def _stages(asked: _Asked) -> dict[str, Reach]:
 
 
 def _with_worst_end(asked: _Asked) -> _Asked:
-    """With two ends of the pulses alone: the longest, and the one after which PV goes farthest on the model itself. More
-    would only take longer to ask what the uncertainty of the model adds."""
+    """With two ends of the pulses alone: the longest, and the one after which PV goes farthest on the model itself. To
+    ask more of them what the uncertainty of the model adds would only take longer."""
     if len(list(_plans(asked, asked.known.model))) == 1:
         return asked
 
