@@ -26,15 +26,15 @@ from loopwright.tuning.experiments.pv_at_rest import LOUD_WINDOW, RUN_OF_REST, W
 from loopwright.tuning.experiments.pv_jump import JumpWatch
 from loopwright.tuning.reasons import FalsePv, Reason
 
-LOUD = {12: (4.5, 3.0), 15: (3.2, 2.5), 20: (2.7, 2.2), 26: (2.5, 2.0)}
+LOUD = {15: (4.5, 2.8), 20: (4.0, 2.5), 26: (3.5, 2.3)}
 """PV is too loud where, over so many values, the mean square of what does not lie between its neighbours exceeds this
 multiple of the variance at rest, without the OUTLIERS_BETWEEN largest (which a jump, or a wrong sample, makes), and
-that of the distance from the median the second one, without the OUTLIERS farthest. White noise meets the second one by
-chance once in 1e8; the first one, once in 1e4 or less whatever way PV moves."""
+that of the distance from the median the second one, without the OUTLIERS farthest. Of white noise the first is met by
+chance once in 1e5, whatever way PV moves. Lower ones took a true PV at its turning points for false."""
 OUTLIERS_BETWEEN, OUTLIERS = 4, 3
 MOST_SELDOM = 4
 """Number of samples from one value to the next from which on the way of PV may look like noise."""
-WHITE = 0.5
+WHITE = 0.6
 """Smallest ratio of von Neumann of noise around a PV that stands still, without the two largest differences; it is far
 smaller where PV moves."""
 QUIET_MORE, LARGE_MOVE = 15, 0.3
@@ -73,7 +73,7 @@ class PvWatch:
         self._run = 1
         self._longest_run = 0
         """The longest run since the first move of MV that PV has ended."""
-        self._jumps = JumpWatch(rest, mv, self._hair, mv_high - mv_low, direction, step)
+        self._jumps = JumpWatch(rest, mv, self._hair, direction, step)
         self._farthest_mv = self._farthest_pv = 0.0
         self._least_change = self._quantum = math.inf
         """The smallest move of PV within a sample, and of these and their differences, PV units."""
@@ -119,13 +119,12 @@ class PvWatch:
         false while it goes on.
         """
         self._jumps.check_end()
-        due = self._unanswered if len(self._changes) < STEADY_CHANGES else self._answer_due
-        if self._rest.lively or due is None:
+        due = self._unanswered
+        if self._rest.lively or self._changes or due is None:
             return
         since = self._n - due
-        if since > RUN_OF_REST * (self._longest_run if self._changes else self._rest.samples) + QUIET_MORE:
-            ever = "" if self._changes else ", as it was before the test,"
-            text = f"PV is exactly {self._last:.6g}{ever} for {since} samples since MV moved"
+        if since > RUN_OF_REST * self._rest.samples + QUIET_MORE:
+            text = f"PV is exactly {self._last:.6g}, as it was before the test, for {since} samples since MV moved"
             raise FalsePv(Reason.PV_FROZEN, f"{text}: the sensor has ended, or MV moves nothing")
 
     def _renewal(self) -> int | None:

@@ -12,9 +12,6 @@ from loopwright.tuning.reasons import Reason, Refused
 
 AVERAGED = 3
 """Number of samples whose mean tells where PV is."""
-JUMPED, PASSED_OVER = 0.5, 6
-"""After a move within a sample of more than the band and this part of all its way, which wrong samples make, so many
-samples are passed over."""
 BAND_NOISES = 5.0
 """The band around rest, in noises, where the relay's hysteresis is narrower."""
 MOVED_NOISES = 5.0
@@ -71,7 +68,6 @@ class HalfWaves:
         self._facts, self._rest, self._noise = facts, point.pv, noise
         self._band = max(hysteresis, BAND_NOISES * noise / math.sqrt(AVERAGED))
         self._last: list[float] = []
-        self._passed_over = 0
         self._samples = 0
         self._delay = 0
         """The number of samples until PV first left its band; 0 where it has not."""
@@ -94,13 +90,6 @@ class HalfWaves:
         up: whether MV drives PV up, if the controller's action is right.
         """
         self._samples += 1
-        if self._passed_over:
-            self._passed_over -= 1
-            return False
-        if self._last and abs(pv - self._last[-1]) > max(self._band, JUMPED * self._farthest):
-            self._passed_over = PASSED_OVER - 1
-            self._last.clear()
-            return False
         self._last = [*self._last[-AVERAGED + 1 :], pv]
         if len(self._last) < AVERAGED:
             return False

@@ -16,8 +16,6 @@ from loopwright.tuning.reasons import FalsePv, Reason
 
 JUMP_NOISES, JUMP_MOVES = 100.0, 20.0
 """A jump is at least so many noises, and so many times the largest move within a sample so far."""
-LOADS = 2.0
-"""No load moves PV within a sample by more than so many times what MV's whole range would, by what MV has moved it."""
 JUMP_STAYS, JUMP_BAND = 6, 0.25
 """PV has to stay for so many samples, and to move by no more than this part of the jump in each of them: behind a lag
 of a sample it goes on faster."""
@@ -72,12 +70,12 @@ class JumpWatch:
     """Looks at each sample from the first move of a test on.
 
     rest: what PV did before.  mv: MV at rest, MV units.  hair: what MV is off home by where it is home, MV units.
-    span: MV's whole range, MV units.  direction: +1 where PV rises with MV, -1 where it falls.
+    direction: +1 where PV rises with MV, -1 where it falls.
     step: the permitted set-point step, PV units: no rounding is so coarse.
     """
 
-    def __init__(self, rest: PvAtRest, mv: float, hair: float, span: float, direction: float, step: float) -> None:
-        self._rest, self._mv_home, self._hair, self._span = rest, mv, hair, span
+    def __init__(self, rest: PvAtRest, mv: float, hair: float, direction: float, step: float) -> None:
+        self._rest, self._mv_home, self._hair = rest, mv, hair
         self._direction, self._step = direction, step
         self._n = 0
         self._last = rest.last
@@ -137,10 +135,7 @@ class JumpWatch:
         largest = max(self._largest, self._largest_of_mv * self._farthest_mv)
         if self._claim is not None:
             largest = max(largest, self._claim.size)
-        fast = JUMP_MOVES * largest
-        if self._largest_of_mv > 0.0:
-            fast = min(fast, LOADS * max(self._largest_of_mv * self._span, largest))
-        least = max(JUMP_NOISES * rest.noise, fast, self._step if renewal is None else 0.0)
+        least = max(JUMP_NOISES * rest.noise, JUMP_MOVES * largest, self._step if renewal is None else 0.0)
         since = self._unanswered_since
         if abs(move) > least > 0.0 and (since is None or rest.renewal == 1):
             side = math.copysign(1.0, mv - self._mv_home)
@@ -184,6 +179,8 @@ class JumpWatch:
                 return
         if jump.since < max(JUMP_STAYS, ways + 1) - 1:
             return
+        if jump.delay is None and self._renewal is None:
+            return  # how often PV is renewed is not known: only the end of the test tells
         if jump.delay is None:
             raise self._false(jump, f"and has stayed there for {jump.since + 1}")
         self._jump, self._claim = None, jump
