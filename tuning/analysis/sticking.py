@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 Array = NDArray[np.float64]
 ROWS, MIN_ROWS = 400, 40
@@ -206,6 +205,8 @@ def _left_by_both(first: Array, second: Array, y: Array) -> float:
 def _driven(inputs: Array, T: float) -> Array:
     """What a plant of gain 1 and this lag, in rows, makes of inputs, shape (..., rows)."""
     share = 1.0 if math.isinf(T) else -math.expm1(-1.0 / T)
+    from scipy.signal import lfilter  # its import takes 0.4 s
+
     return np.asarray(lfilter([share], [1.0, -1.0 if math.isinf(T) else share - 1.0], inputs))
 
 
