@@ -22,8 +22,9 @@ PEAK = 8.0
 """Power of a peak of the spectrum, in medians."""
 SPANS = ((0.0, 1.0), (0.0, 100.0))
 """What MV of a time-proportioned output is between: off all the time, on all the time."""
-OSCILLATES = 0.6
-"""Part of the variance of PV at rest that one period has to make for PV to be said to swing."""
+OSCILLATES, SHOWS = 0.6, 0.3
+"""Parts of the variance of PV at rest that one period has to make: for PV to be at no rest, and for a swing to show in
+it (white noise reaches 0.15 in 120 samples)."""
 MIN_WINDOWS = 4.0
 """Windows that the rest must hold to tell the length of one."""
 CLEARER, CLEARER_THAN_OTHERS = 30.0, 12.0
@@ -83,10 +84,10 @@ class Oscillation:
     in_words: str
 
 
-def oscillation_at_rest(pv: Reals, mv: Reals, Ts: float) -> Oscillation | None:
+def oscillation_at_rest(pv: Reals, mv: Reals, Ts: float, part: float = OSCILLATES) -> Oscillation | None:
     """What swings PV while the loop rests, None where nothing does.
 
-    pv, mv: absolute, PV and MV units, shape (N,). Ts: s.
+    pv, mv: absolute, PV and MV units, shape (N,). Ts: s. part: of the variance that one period has to make.
     """
     trend = np.vander(np.linspace(-1.0, 1.0, len(pv)), 3)
     rest = _left(pv, trend)
@@ -105,7 +106,7 @@ def oscillation_at_rest(pv: Reals, mv: Reals, Ts: float) -> Oscillation | None:
 
     of_sine, length = min((by_sine(each), each) for each in near)
     of_window, window = min(_by_windows(rest, mv, near, trend), default=(math.inf, math.nan))
-    if of_sine > (1.0 - OSCILLATES) * variance and of_window > (1.0 - OSCILLATES) * variance:
+    if min(of_sine, of_window) > (1.0 - part) * variance:
         return None
     by = float(np.quantile(rest, 0.98) - np.quantile(rest, 0.02))
     swings = Oscillation(False, f"PV swings by {by:.2g} at rest, with a period of {length * Ts:.3g} s")

@@ -8,7 +8,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from loopwright.tuning.analysis.pv_faults import pv_faults
+from loopwright.tuning.analysis.pv_faults import pv_faults, without_wrong_samples
+from loopwright.tuning.analysis.window import SHOWS, oscillation_at_rest
 from loopwright.tuning.fast.experiment import Experiment
 from loopwright.tuning.fast.mv_faults import find_mv_fault
 from loopwright.tuning.fast.record import ExperimentRecord
@@ -67,13 +68,21 @@ def with_what_hides(refused: Refused, record: ExperimentRecord, pv: Reals, mv_at
     if step > COARSE * record.output_range and refused.reason is not Reason.STALLED:
         text = f"PV is rounded to {step:.3g}, and the test moved it by {record.output_range:.3g} only"
         return Refused(Reason.PV_ALTERED, text)
+    rest = slice(0, record.listened)
+    swings = oscillation_at_rest(without_wrong_samples(pv)[rest], record.u[rest] + mv_at_rest, record.Ts, SHOWS)
+    if swings is not None and swings.by_window:
+        return Refused(Reason.MV_ALTERED, swings.in_words)
     if not record.period:  # the test ended before the record had a time scale, which a fit needs
         return refused
     fit = Fit(record)
     fault = find_mv_fault(fit, choose_structure(fit).best, mv_at_rest)
     if fault is not None:
         return Refused(Reason.MV_ALTERED, f"{fault.what}; the record is explained so, and not by MV as it is")
-    return refused
+    if swings is None:
+        return refused
+    if refused.reason is Reason.UNEXPLAINED:  # what was found of the plant may be of this
+        return Refused(Reason.DISTURBED, f"{swings.in_words}, before the test moved it")
+    return Refused(refused.reason, f"{swings.in_words}; {refused.detail}")
 
 
 def of_pv(pv: Reals, Ts: float) -> str | None:
