@@ -290,7 +290,7 @@ def test_a_whole_run_on_a_second_path_later_than_the_record(method: str) -> None
 def test_a_gain_that_is_larger_under_the_new_gains_is_refused_after_the_step_back() -> None:
     """Gains were proposed with which Ms is 2.07, as a load disturbance with the step would look the same."""
     plant = next(each for each in trouble_plants() if each.name == "lag, dead time 1")
-    found = measure((plant, "setpoint", "gain changes with the new gains: x 1.6, 5 % noise", 1))
+    found = measure((plant, "setpoint", "gain changes with the new gains: x 1.6, 5 % noise", 2))
     assert found.reason == "unexplained"
     shown = re.search(r"the plant's gain is ([0-9.]+) times what it was before the new gains took over", found.detail)
     assert shown is not None and 1.3 < float(shown[1]) < 1.9
