@@ -2,6 +2,7 @@
 
     python -m benchmarks
     python -m benchmarks answers engine     # only the figures of these, as JSON
+    python -m benchmarks preview            # an hour: only where it is asked for
 
 A benchmark that lacks something on this machine has a row that says what; the others run. The exit status is 1 when one
 of them went wrong, or one that was asked for by name could not be measured.
@@ -23,6 +24,8 @@ from benchmarks.command import CANNOT, check_names, parser_of
 from benchmarks.table import HEAD, ROWS, row
 
 WITH_VCAN = ("tools/with-vcan", "--again", "--timeout", "900", "--")
+APART = ("preview",)
+"""Those that take an hour: they are run by name only."""
 NO_VCAN = "no CAN interface vcan0 is to be had, tools/with-vcan says above what to install"
 
 
@@ -78,14 +81,15 @@ def figures(benchmark: Benchmark) -> dict[str, Any] | NotMeasured:
 def main(argv: Sequence[str] | None = None, benchmarks: dict[str, Benchmark] = BENCHMARKS) -> int:
     parser = parser_of(__doc__)
     parser.add_argument(
-        "names", metavar="NAME", nargs="*", help=f"any of {', '.join(benchmarks)}; default: all of them"
+        "names", metavar="NAME", nargs="*", help=f"any of {', '.join(benchmarks)}; default: all but {', '.join(APART)}"
     )
     names = parser.parse_args(argv).names
     check_names(parser, "benchmark", names, benchmarks)
     loads = [os.getloadavg()[0]]
     found: dict[str, dict[str, Any]] = {}
     without: dict[str, NotMeasured] = {}
-    for name in names or benchmarks:
+    asked = names or [name for name in benchmarks if name not in APART]
+    for name in asked:
         print(f"{name} ...", file=sys.stderr, flush=True)
         answer = figures(benchmarks[name])
         if isinstance(answer, NotMeasured):
@@ -103,7 +107,7 @@ def main(argv: Sequence[str] | None = None, benchmarks: dict[str, Benchmark] = B
         f"load average before and after each part: {', '.join(f'{load:.1f}' for load in loads)}\n"
     )
     lines = list(HEAD)
-    for name in benchmarks:
+    for name in asked:
         lines += [row(name, f"not measured: {without[name].why}")] if name in without else ROWS[name](found[name])
     print("\n".join(lines))
     print("\n" + json.dumps(found, indent=1), file=sys.stderr)

@@ -179,7 +179,8 @@ def tested(
     noise = seen.noise * process.noise
     plant = SensedPlant(process.plant(), noise, seen.quantum * process.noise, seen.renewal, seed)
     loop = Tested(process, plant, channel, fault, at, loads)
-    limits = RunLimits(-1e6, 1e6, 0.0, 100.0, max_time_s=500.0 * process.T95, max_frozen_s=3.0 * process.T95)
+    T95, step = process.T95, process.step
+    limits = RunLimits(-1e6, 1e6, 0.0, 100.0, max_time_s=500.0 * T95, max_frozen_s=3.0 * T95, sp_deviation=step)
     return run(plans[method](), loop, limits=limits, on_event=loop.hear), loop
 
 

@@ -1,6 +1,6 @@
 """Whether PV stays within what the preview says, and how near it comes to that, on plants drawn at random.
 
-    python -m benchmarks.preview [--plants N] [--first NUMBER] [--save FILE]
+    python -m benchmarks.preview [--plants N] [--first NUMBER] [--ways WAY ...] [--save FILE]
 
 Each plant is tested once, which leaves a model (by the relay, by pulses, or the plant itself is entered). Then the
 preview of every way to move the loop is asked for, and the retune is made, undisturbed, with another noise. Plants from
@@ -163,11 +163,12 @@ def known(of: Drawn, by: str) -> LoopModel:
     return LoopModel(plant.model(), "entered", None, of.noise)
 
 
-def measured(number: int) -> list[Said]:
+def measured(number: int, ways: Sequence[str] = tuple(WAYS)) -> list[Said]:
     of = drawn(number)
     model = known(of, BY[number % len(BY)])
     found = []
-    for way, asked in WAYS.items():
+    for way in ways:
+        asked = WAYS[way]
         request = retune_request(**asked, propose_anyway=True)
         loop = of.loop(Mode.MANUAL if way == "manual" else Mode.AUTOMATIC, 2)
         config, state = within(of.config, request), loop.read()
@@ -181,16 +182,18 @@ def measured(number: int) -> list[Said]:
     return found
 
 
-def run(plants: int = PLANTS, first: int = FIRST, file: Path | None = None) -> dict[str, Any]:
+def run(
+    plants: int = PLANTS, first: int = FIRST, ways: Sequence[str] = tuple(WAYS), file: Path | None = None
+) -> dict[str, Any]:
     """The figures, in all and of each way to move the loop."""
     found = saved(Said, file)
     done = {each.plant for each in found}
     for number in range(first, first + plants):
         if random_plant(number).name not in done:
-            found += [kept(each, file) for each in measured(number)]
+            found += [kept(each, file) for each in measured(number, ways)]
     runs = [each for each in found if each.bound[""] > 0.0 and each.went[""] > 0.0]
-    ways = {way: _figures([each for each in runs if each.way == way]) for way in WAYS}
-    return {"plants": plants, **_figures(runs), "ways": ways}
+    by_way = {way: _figures([each for each in runs if each.way == way]) for way in ways}
+    return {"plants": plants, **_figures(runs), "ways": by_way}
 
 
 def _figures(runs: Sequence[Said]) -> dict[str, Any]:
@@ -208,6 +211,7 @@ if __name__ == "__main__":
     parser = parser_of(__doc__)
     parser.add_argument("--plants", type=int, default=PLANTS, help="how many (default: %(default)s)")
     parser.add_argument("--first", type=int, default=FIRST, help="the number of the first (default: %(default)s)")
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS), help="(default: all)")
     parser.add_argument("--save", type=Path, help="a file of runs to go on from, and to add to")
     given = parser.parse_args()
-    show(partial(run, given.plants, given.first, given.save))
+    show(partial(run, given.plants, given.first, given.ways, given.save))

@@ -115,7 +115,9 @@ def cases() -> dict[str, Case]:
         "wrong_sign": Case(
             "the controller is set to direct action on a plant of positive gain", reverse=False, gains=Gains(1e-6, 0.0)
         ),
-        "cannot_oscillate": Case("a load as large as the relay comes right after its start", mv=_load(20.0, 3.0)),
+        "cannot_oscillate": Case(
+            "T95 is stated as 26 s; the lag is 240 s", num=(1.0,), den=(240.0, 1.0), dead_time_s=20.0
+        ),
         "stalled": Case("a load of twice the relay comes in its second period", mv=_load(60.0, 12.0)),
         "unexplained": Case("the valve sticks: it moves only when pushed by 12 %", mv=Sticking(12.0), seed=2),
         "disturbed": Case(

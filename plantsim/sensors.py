@@ -19,12 +19,15 @@ class SensorFault(StrEnum):
     """Half of its last value, exactly."""
     HALVED = "halved"
     """Half of what it should send, noise and all."""
+    RAISED = "raised"
+    """A fifth more than it should send, noise and all."""
     QUIET = "quiet"
     """Its last value, with a quarter of its noise."""
     LOUD = "loud"
     """Its last value, with four times its noise."""
 
 
+PART = {SensorFault.HALVED: 0.5, SensorFault.RAISED: 1.2}
 NOISE = {SensorFault.QUIET: 0.25, SensorFault.LOUD: 4.0}
 
 
@@ -76,8 +79,8 @@ class SensedPlant:
                 return 0.0
             case SensorFault.HALF:
                 return 0.5 * self._at_fault
-            case SensorFault.HALVED:
-                value = 0.5 * (self.plant.pv + self._drawn())
+            case SensorFault.HALVED | SensorFault.RAISED:
+                value = PART[self._fault] * (self.plant.pv + self._drawn())
             case SensorFault.QUIET | SensorFault.LOUD:
                 value = self._at_fault + NOISE[self._fault] * self._drawn()
         return round(value / self._quantum) * self._quantum if self._quantum else value

@@ -91,7 +91,8 @@ ADVICE: dict[Reason, str] = {
     Reason.WRONG_SIGN: "Check the controller's action (direct/reverse) against the sign of the plant's gain.",
     Reason.NO_RESPONSE: "PV did not answer MV: check the valve, the sensor and that the right loop is selected.",
     Reason.CANNOT_OSCILLATE: "The plant has next to no dead time, or the sampling is too slow to see it "
-    "(22 samples a period at least): sample faster, or use a model-based rule.",
+    "(22 samples a period at least): sample faster, or use a model-based rule. Or T95 is stated far too short: state "
+    "it longer.",
     Reason.SAMPLING_TOO_SLOW: "Choose a sample time of at most a fiftieth of the ultimate period.",
     Reason.NO_BRACKET: "The ultimate gain was not found within a factor 8 of the relay's estimate; "
     "check for backlash, sticking or another loop acting on this one.",
@@ -137,13 +138,13 @@ ADVICE: dict[Reason, str] = {
     "robust loop ask for another Ms, for a proposal all the same set propose_anyway.",
     Reason.PV_LIMIT: "PV reached its limit: permit less MV deviation, or widen the PV limits if it is safe.",
     Reason.TIME_BUDGET: "The test took longer than its budget: check T95, or raise the budget.",
-    Reason.BAD_SAMPLE: "PV was not a finite number, or jumped as the plant cannot: check the sensor and its scaling. "
-    "Where the loop was put in manual for it, control it by hand; when PV is right again, sign the alarm off (or "
-    "loopwright dismiss TAG), put the loop in automatic, then retune.",
+    Reason.BAD_SAMPLE: "PV was not a finite number, or another one than the plant can give: check the sensor and its "
+    "scaling. Where the message says that PV is false, see that the loop is in manual, and control it by hand; when PV "
+    "is right again, sign the alarm off (or loopwright dismiss TAG), put the loop in automatic, then retune.",
     Reason.SAMPLES_LOST: "Samples were lost on the way: check bus load, or run a simulated plant more slowly.",
-    Reason.PV_FROZEN: "PV stood still, or had another noise, as the plant cannot: check the sensor. A loop that was in "
-    "automatic was put in manual for it: control it by hand; when PV is right again, sign the alarm off (or loopwright "
-    "dismiss TAG), put the loop in automatic, then retune.",
+    Reason.PV_FROZEN: "PV stood still, or had another noise, as the plant cannot: check the sensor, see that the loop "
+    "is in manual (the message says what it was left in), and control it by hand; when PV is right again, sign the "
+    "alarm off (or loopwright dismiss TAG), put the loop in automatic, then retune.",
     Reason.SETPOINT_CHANGED: "Somebody else moved the set-point during the test; agree on the time and repeat.",
     Reason.MODE_CHANGED: "Somebody else changed the mode during the test; agree on the time and repeat.",
     Reason.GAINS_CHANGED: "Somebody else tried other gains during the test; agree on the time and repeat.",

@@ -36,6 +36,9 @@ _BUS_ADVICE = (
 _EAR_ADVICE = "It is started again by itself. Tests go on; what the loops do is not seen until then."
 _GATEWAY_ADVICE = f"{ADVICE[Reason.GATEWAY_LOST]} What is abnormal there is not known here meanwhile."
 _SEE_THE_JOB = "See the job."
+_WHEN_PV_IS_RIGHT = (
+    "Check the sensor, and control the loop by hand; when PV is right again, sign this off and put it in automatic."
+)
 _UNTIL_SIGNED = "It stays until somebody signs it off."
 
 
@@ -159,9 +162,9 @@ def _tests(known: AlarmFacts) -> Iterator[Condition]:
     """What remains of tests that have ended."""
     unconfirmed = {job.id for job in known.unconfirmed} | {job.id for job in known.false_pvs}
     for found in known.false_pvs:
-        advice = _SEE_THE_JOB if found.reason is None else ADVICE[found.reason]
+        text, advice = _false_pv(found)
         yield Condition(
-            alarm_id(AlarmKind.FALSE_PV, found.id), AlarmKind.FALSE_PV, found.loop, _false_pv(found),
+            alarm_id(AlarmKind.FALSE_PV, found.id), AlarmKind.FALSE_PV, found.loop, text,
             f"{advice} No test begins until somebody signs this off.", found.host, found.loop, (found.loop,),
             f"/jobs/{found.id}", _seconds(found.at),
         )  # fmt: skip
@@ -197,15 +200,17 @@ def _of_the_end(job_id: str) -> set[str]:
     return {alarm_id(kind, job_id) for kind in (AlarmKind.NOT_RESTORED, AlarmKind.FALSE_PV)}
 
 
-def _false_pv(job: FalsePvJob) -> str:
-    """Returns what was found, and what the loop was left in."""
-    found = f"PV was found to be false in a test{': it stood still' if job.reason is Reason.PV_FROZEN else ''}"
+def _false_pv(job: FalsePvJob) -> tuple[str, str]:
+    """Returns what was found and what the loop was left in, and what is to be done."""
+    found = "PV was found to be false in a test"
     if job.restored is None:
-        return f"{found}; the loop could not be read back"
+        text = f"{found}; the loop could not be read back"
+        return text, f"Look at the loop now: it may be in automatic on this PV. Put it in manual. {_WHEN_PV_IS_RIGHT}"
     state = loop_state(job.restored)
-    mode = state.mode.name.lower()
-    at = "" if state.mode is PlanMode.AUTOMATIC else f" at MV {state.held_mv:.6g} %"
-    return f"{found}; the loop was left in {mode}{at}"
+    text = f"{found}; the loop was left in {state.mode.name.lower()}"
+    if state.mode is PlanMode.AUTOMATIC:
+        return text, f"Look at the loop now: unless somebody has put it in manual, do that. {_WHEN_PV_IS_RIGHT}"
+    return f"{text} at MV {state.held_mv:.6g} %", _WHEN_PV_IS_RIGHT
 
 
 def _watches(known: AlarmFacts) -> Iterator[Condition]:

@@ -35,7 +35,7 @@ from loopwright.service.api import (
 from loopwright.service.api import live as live_api
 from loopwright.service.api.aborts import BODY, SaidBy, stopping
 from loopwright.service.api.bodies import JsonRoute, signed_test
-from loopwright.service.api.event_views import StoredEventView, event_view
+from loopwright.service.api.event_views import STREAMED_EVENT, StoredEventView, event_view
 from loopwright.service.api.events import event_stream, still_permitted
 from loopwright.service.api.gate.access_log import Access, count_failures_of
 from loopwright.service.api.gate.gate import Gate, Policy
@@ -264,8 +264,8 @@ def create_app(
         response_class=StreamingResponse,
         responses={
             200: {
-                "content": {"text/event-stream": {"schema": {"$ref": "#/components/schemas/JobEventView"}}},
-                "description": "Events. The schema is that of the data of each; its kind is the event's name too",
+                "content": {"text/event-stream": {"schema": STREAMED_EVENT}},
+                "description": "Events. The data of each is a JobEventView; its kind is the event's name too",
             },
             204: {"description": "The job is over and the client has received every event; it should not reconnect"},
             **problems.responses(404, 422),

@@ -138,6 +138,21 @@ class JobEventView(RootModel[Annotated[Stored | ProgressEvent, Field(discriminat
     """An event of a job, as the stream has it."""
 
 
+STREAMED_EVENT: Schema = {
+    "type": "object",
+    "properties": {
+        "id": {"type": "string"},
+        "event": {"type": "string"},
+        "data": {
+            "type": "string",
+            "contentMediaType": "application/json",
+            "contentSchema": {"$ref": "#/components/schemas/JobEventView"},
+        },
+    },
+}
+"""An event of the stream, as server-sent events have it."""
+
+
 def event_view(event: JobEvent) -> StoredEventView:
     """The view of a stored event. One that an older or a newer version has stored in a form of its own is a note."""
     common = {"id": event.seq, "at": event.at, "plant_time_s": event.plant_time_s}

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Path
+from fastapi import APIRouter, Body, Path, Query
 
 from loopwright.service.api import problems
 from loopwright.service.api.routes import new_router
@@ -42,12 +42,19 @@ def router(jobs: Jobs, fleet: Fleet, pool: Pool) -> APIRouter:
         summary="Preview a retune: its moves, time and limits, and every reason why it would be refused now",
         responses=problems.responses(404, 422, 503),
     )
-    def preview_retune(tag: Tag, options: Annotated[RetuneRequest | None, Body()] = None) -> Preview:
+    def preview_retune(
+        tag: Tag,
+        options: Annotated[RetuneRequest | None, Body()] = None,
+        pv: Annotated[
+            bool,
+            Query(description="Whether to compute how far PV goes, which can take seconds; false: the rest, at once"),
+        ] = True,
+    ) -> Preview:
         request = options or FastRetune()
         config, _ = jobs.directory.owner(tag)
         now = _now(jobs, tag, request)
         known = jobs.knowledge.of(tag, None if now.state is None else now.state.gains)
-        told = _expected(jobs, pool, config, request, now)
+        told = _expected(jobs, pool, config, request, now) if pv else NOTHING_EXPECTED
         return preview(config, request, now, _last(jobs.store.last_models(tag).get(tag)), known, told)
 
     @routes.post(

@@ -491,7 +491,11 @@ def dismiss(
         print_json(answer)
         return
     jobs = parsed(DismissedView, answer).jobs
-    print(f"{loop} is looked after no more ({', '.join(jobs)})" if jobs else f"{loop} was not looked after")
+    if jobs:
+        print(f"{loop}: you answer for it now. It is looked after for no test, and no false PV keeps a test from it.")
+        print(f"Acknowledged: {', '.join(jobs)}")
+    else:
+        print(f"{loop}: there was nothing to acknowledge. It was not looked after, and no test has found its PV false.")
 
 
 app.command("methods")(tuning.methods)

@@ -29,7 +29,7 @@ from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.design_trial import designed_on, trial
-from loopwright.tuning.fast.expected_moves import NewGains, expected_moves
+from loopwright.tuning.fast.expected_moves import LAST_LEVEL_TURNS, NewGains, expected_moves
 from loopwright.tuning.fast.experiment import on_trial
 from loopwright.tuning.fast.procedure import FastOptions
 from loopwright.tuning.fast.proposal import ultimate
@@ -87,7 +87,7 @@ def near_limits(config: LoopConfig, request: RetuneRequest, state: LoopState, kn
 @dataclass(frozen=True, slots=True)
 class _Asked:
     """facts: of the loop around its rest, sampled no faster than the simulation needs. rest: PV there, PV units.
-    begins_with: as of `FastOptions`."""
+    begins_with: as of `FastOptions`. ends: of the pulses of the set-point, as of `expected_moves`."""
 
     config: LoopConfig
     request: RetuneRequest
@@ -96,6 +96,7 @@ class _Asked:
     known: LoopModel
     rest: float
     begins_with: float | None = None
+    ends: tuple[float, ...] = LAST_LEVEL_TURNS
 
     @property
     def noise(self) -> float:
@@ -178,16 +179,34 @@ def _stages(asked: _Asked) -> dict[str, Reach]:
     """How far PV goes in each stage. What the uncertainty of the model adds is that of its axes, as of independent
     errors."""
     likely = _ranges(asked, asked.known.model)
-    others = [_ranges(asked, each) for each in _neighbours(asked.known)]
+    beside, others = likely, []
+    if asked.known.covariance is not None:
+        asked = _with_worst_end(asked)
+        beside = _ranges(asked, asked.known.model)
+        others = [_ranges(asked, each) for each in _neighbours(asked.known)]
     margin = ROUGH if asked.known.rough else 1.0 + (MARGIN_UNKNOWN if asked.known.covariance is None else MARGIN)
     noises, found = NOISES * asked.noise, {}
     for stage, (low, high) in likely.items():
         near = [each[stage] for each in others if stage in each]
-        open_down, open_up = (math.hypot(*(each[side] - at for each in near)) for side, at in ((0, low), (1, high)))
+        at = beside.get(stage, (low, high))
+        open_down, open_up = (math.hypot(*(each[side] - at[side] for each in near)) for side in (0, 1))
         down = min(DEVIATIONS / STEP * open_down, -MOST_OPEN * low) - low
         up = min(DEVIATIONS / STEP * open_up, MOST_OPEN * high) + high
         found[stage] = Reach(margin * down + noises, margin * up + noises, noises - low, noises + high)
     return found
+
+
+def _with_worst_end(asked: _Asked) -> _Asked:
+    """With two ends of the pulses alone: the longest, and the one after which PV goes farthest on the model itself. To
+    ask more of them what the uncertainty of the model adds would only take longer."""
+    if len(list(_plans(asked, asked.known.model))) == 1:
+        return asked
+
+    def farthest(end: float) -> float:
+        ranges = _ranges(replace(asked, ends=(end,)), asked.known.model)
+        return max((max(-low, high) for low, high in ranges.values()), default=0.0)
+
+    return replace(asked, ends=(LAST_LEVEL_TURNS[0], max(LAST_LEVEL_TURNS[1:], key=farthest)))
 
 
 def _neighbours(known: LoopModel) -> Iterator[Model]:
@@ -232,7 +251,8 @@ def _plans(asked: _Asked, model: Model) -> Iterator[tuple[Plan[Any], Mode]]:
     for each in tried:
         after_pulses = each is Excitation.RELAY and Excitation.SETPOINT in tried
         mode = Mode.MANUAL if each is Excitation.MANUAL else Mode.AUTOMATIC
-        yield expected_moves(each, facts, asked.noise, options, model, new, after_pulses), mode
+        for turns in asked.ends if each is Excitation.SETPOINT and new is not None else LAST_LEVEL_TURNS[:1]:
+            yield expected_moves(each, facts, asked.noise, options, model, new, after_pulses, turns), mode
 
 
 @lru_cache(256)

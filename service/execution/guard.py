@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 
 from loopwright.service.states.loop_state import LoopState
-from loopwright.tuning.experiments.false_pv import PvAtRest, PvWatch, check_end_of_rest
+from loopwright.tuning.experiments.false_pv import PvWatch
+from loopwright.tuning.experiments.pv_at_rest import PvAtRest, check_end_of_rest
 from loopwright.tuning.plan import Sample
 from loopwright.tuning.reasons import Failed, FalsePv, Reason
 
@@ -21,6 +22,7 @@ class RunLimits:
     max_gap_samples: number of samples in a row that may be missing.
     max_frozen_s: how long a PV of which nothing else is known may stay exactly constant while MV differs from its
     initial value, s of plant time; longer than any dead time.
+    sp_deviation: the permitted set-point step, PV units: no PV is rounded so coarsely.
     """
 
     pv_low: float = -math.inf
@@ -30,6 +32,7 @@ class RunLimits:
     max_time_s: float = math.inf
     max_gap_samples: int = 5
     max_frozen_s: float = math.inf
+    sp_deviation: float = math.inf
 
 
 class Guard:
@@ -58,10 +61,29 @@ class Guard:
             self._acting = True
             check_end_of_rest(self._at_rest)
 
+    def look_on(self, sample: Sample) -> bool:
+        """Takes one more sample after the end, where PV may have jumped; whether it is to be looked at further.
+        Raises FalsePv."""
+        if self._watch is None or not (math.isfinite(sample.pv) and math.isfinite(sample.mv)):
+            return False
+        self._watch.check(sample.pv, sample.mv)
+        return self._watch.undecided
+
+    @property
+    def undecided(self) -> bool:
+        """Whether PV has just jumped, and may be false."""
+        return self._watch is not None and self._watch.undecided
+
+    def check_end(self) -> None:
+        """Raises FalsePv where the run ends without a result on a PV that is still, or has jumped, as a true one would
+        not have had to."""
+        if self._watch is not None:
+            self._watch.check_end()
+
     def check(self, sample: Sample) -> None:
         """Raises Failed when the sample violates a limit; FalsePv where PV is false within its limits."""
         t, _, pv, mv, _ = sample
-        limits = self._limits
+        limits, acting = self._limits, self._acting
         if not (math.isfinite(pv) and math.isfinite(mv)):
             raise Failed(Reason.BAD_SAMPLE, f"at {t:.3f} s PV is {pv}, MV is {mv}")
         if self._start is None:
@@ -70,8 +92,10 @@ class Guard:
             raise Failed(Reason.SAMPLES_LOST, f"{(t - self._last) / self._dt - 1:.0f} samples missing before {t:.3f} s")
         self._last = t
         if not limits.pv_low <= pv <= limits.pv_high:
+            if acting and self._watch is not None:
+                self._watch.check(pv, mv)
             raise Failed(Reason.PV_LIMIT, f"PV {pv:.5g} left {limits.pv_low:.5g} .. {limits.pv_high:.5g} at {t:.3f} s")
-        if self._acting and not limits.mv_low - self._slack <= mv <= limits.mv_high + self._slack:
+        if acting and not limits.mv_low - self._slack <= mv <= limits.mv_high + self._slack:
             raise Failed(Reason.MV_LIMIT, f"MV {mv:.5g} left {limits.mv_low:.5g} .. {limits.mv_high:.5g} at {t:.3f} s")
         if t - self._start > limits.max_time_s:
             raise Failed(Reason.TIME_BUDGET, f"{t - self._start:.0f} s of plant time are over the budget")
@@ -86,7 +110,8 @@ class Guard:
             if self._watch is None:
                 state = self._state
                 rest, direction = PvAtRest.of(self._at_rest), 1.0 if state.reverse_acting else -1.0
-                self._watch = PvWatch(rest, self._mv_at_rest, direction, state.mv_low, state.mv_high)
+                step = self._limits.sp_deviation
+                self._watch = PvWatch(rest, self._mv_at_rest, direction, state.mv_low, state.mv_high, step)
                 self._at_rest.clear()
             self._watch.check(pv, mv)
         if pv != self._pv:

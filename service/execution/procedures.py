@@ -132,6 +132,7 @@ def tune(
         mv_high=facts.mv_high,
         max_time_s=request.max_time_s or time_budget_s(request.method, facts.T95_s, facts.sample_time_s),
         max_frozen_s=FROZEN_T95 * config.t95_s,
+        sp_deviation=config.sp_deviation,
     )
     computing = ComputingLoop(loop, workers)
     ran = run(

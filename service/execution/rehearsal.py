@@ -391,7 +391,8 @@ def rehearse_process(
     settings = Settings(mv_low=low, mv_high=high, safe_output=mv, pv_low=-span, pv_high=span, reverse=reverse_acting)
     channel = Channel(sample_time_s, settings, _parameters(gains), pv, int(Mode.AUTOMATIC), mv)
     facts = Facts(sample_time_s, t95_s, low, high, sp_deviation, gains, reverse_acting)
-    limits = RunLimits(pv_low, pv_high, low, high, max_time_s=500 * t95_s, max_frozen_s=3 * t95_s)
+    far = (pv_low, pv_high, low, high)
+    limits = RunLimits(*far, max_time_s=500 * t95_s, max_frozen_s=3 * t95_s, sp_deviation=sp_deviation)
     loop = RehearsedLoop(_OwnProcess(step, pv), channel, sample_time_s)
     try:
         asked = _asked(method, None, options)
@@ -476,8 +477,16 @@ def _limits(facts: Facts, reach: float) -> RunLimits:
     """Returns the limits of a rehearsal. They are wide: an unstable plant must end, but the test moves PV by several
     steps."""
     far = max(100 * facts.sp_deviation, 10 * reach)
-    low, high = facts.mv_low, facts.mv_high
-    return RunLimits(-far, far, low, high, max_time_s=500 * facts.T95_s, max_frozen_s=3 * facts.T95_s)
+    T95_s = facts.T95_s
+    return RunLimits(
+        -far,
+        far,
+        facts.mv_low,
+        facts.mv_high,
+        max_time_s=500 * T95_s,
+        max_frozen_s=3 * T95_s,
+        sp_deviation=facts.sp_deviation,
+    )
 
 
 def _reach(file: PlantFile) -> float:

@@ -17,6 +17,7 @@ from loopwright.service.states.loop_state import LoopState, after_false_pv
 from loopwright.tuning.plan import (
     Command,
     Event,
+    Mode,
     Note,
     Plan,
     Sample,
@@ -100,11 +101,13 @@ class _Run(Generic[T]):
         self._result: RunResult[T] = RunResult()
         self._samples: list[Sample] = []
         self._home: LoopState | None = None
+        self._guard: Guard | None = None
         self._stage, self._since, self._now = "", 0.0, 0.0
 
     def to_the_end(self) -> RunResult[T]:
         self._until_something_ends_it()
         self._enter("")
+        self._doubt_pv()
         if self._home is not None:
             if isinstance(self._result.ended, FalsePv):
                 self._hold()
@@ -140,7 +143,7 @@ class _Run(Generic[T]):
 
     def _pump(self, home: LoopState) -> None:
         """Steps the loop until the plan, the guard, the loop or a stop request ends it, each by an exception."""
-        guard = Guard(self._limits, home)
+        guard = self._guard = Guard(self._limits, home)
         chunk = min(CHUNK, max(1, round(CHUNK_S / home.sample_time_s)))
         answer = next(self._plan)
         while True:
@@ -195,6 +198,33 @@ class _Run(Generic[T]):
     def _when(self) -> str:
         return f"at {self._now:.3f} s of plant time, in stage {self._stage or 'start'}"
 
+    def _doubt_pv(self) -> None:
+        """A test that ends without a result may have ended so by a PV that is false: the loop is not given back to
+        automatic on it. Where others have changed the loop, or it is not reached, it ends as that."""
+        ended = self._result.ended
+        others = isinstance(ended, Aborted) and ended.reason not in (Reason.OPERATOR, Reason.SERVICE_STOPPED)
+        if self._guard is None or ended is None or others or ended.reason in _UNREACHED or isinstance(ended, FalsePv):
+            return
+        try:
+            self._look_on(self._guard)
+            self._guard.check_end()
+        except FalsePv as false:
+            self._result.ended = FalsePv(false.reason, f"{false.detail} (without that: {ended})")
+
+    def _look_on(self, guard: Guard) -> None:
+        """Looks at a few more samples with MV as it was before the test, where PV has just jumped: whether it stays.
+        Raises FalsePv."""
+        commands: list[Command] = [SetMode(Mode.MANUAL), SetOutput(self._home.mv)] if self._home is not None else []
+        looks = guard.undecided
+        while looks:
+            try:
+                sample = self._loop.step(commands)
+            except Ended as ended:
+                self._on_event(Note(f"PV could not be looked at any longer: {ended}"))
+                return
+            self._samples.append(sample)
+            commands, looks = [], guard.look_on(sample)
+
     def _hold(self) -> None:
         """Holds the loop at the MV before the test: no control law may answer a false PV."""
         self._on_event(Note(f"PV is false: {self._result.ended.detail if self._result.ended else ''}"))
@@ -202,6 +232,8 @@ class _Run(Generic[T]):
             self._loop.hold()
         except Ended as ended:
             self._on_event(Note(f"the loop could not be held: {ended.detail}"))
+        except Exception as defect:  # it is restored all the same
+            self._on_event(Note(f"the loop could not be held, by a defect: {defect!r}"))
 
     def _restore(self, home: LoopState) -> None:
         """Restores the loop. A loop whose restoration is not confirmed leaves no proposal."""

@@ -14,7 +14,7 @@ from loopwright.service.planning.curves import horizons, loop_curves
 from loopwright.service.planning.found_model import DISPROVED, FoundModel, found_model
 from loopwright.service.results import DESIGNED
 from loopwright.service.states.job_state import ACTIVE
-from loopwright.service.states.loop_state import loop_state
+from loopwright.service.states.loop_state import gains_of, loop_state
 from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.fast.design import Aim, DesignSpec, OptimalGains, aim_of
@@ -142,6 +142,14 @@ def asked_spec(row: Job, Ms: float) -> DesignSpec:
 def new_gains(row: Job) -> Gains | None:
     """Returns the gains of the result of a job; None where it has none."""
     return None if row.result is None or row.result.new_gains is None else row.result.new_gains.gains()
+
+
+def old_gains(row: Job) -> Gains | None:
+    """Returns the gains before a job; of a rehearsal, which finds none on a loop, those of its result. None where
+    neither is known."""
+    if row.old_gains:
+        return gains_of(row.old_gains)
+    return None if row.result is None or row.result.old_gains is None else row.result.old_gains.gains()
 
 
 def job_model(row: Job, events: Sequence[JobEvent]) -> FoundModel:

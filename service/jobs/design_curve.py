@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 from pydantic import AliasChoices, Field
 
-from loopwright.service.jobs.alternatives import asked_spec, new_gains
+from loopwright.service.jobs.alternatives import asked_spec, new_gains, old_gains
 from loopwright.service.jsonable import json_object
 from loopwright.service.planning.curves import Horizons, LoopCurves, horizons, loop_curves
 from loopwright.service.results import Figures, GainsView, PerformanceView
-from loopwright.service.states.loop_state import gains_of, loop_state
+from loopwright.service.states.loop_state import loop_state
 from loopwright.service.store.jobs import Job
 from loopwright.tuning.analysis.comparison import beside, loop_performance
 from loopwright.tuning.fast.design import Aim, DesignSpec, GainDesign
@@ -146,7 +146,7 @@ def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> Desig
         Ts = loop_state(row.found).sample_time_s if row.found else 0.0
         designing = _on_model(model, Ts, spec)
         delay_s, words = 0.5 * Ts, "the job's model"
-    old, new = None if not row.old_gains else gains_of(row.old_gains), new_gains(row)
+    old, new = old_gains(row), new_gains(row)
     before, after = (None if each is None else designing.performance(each) for each in (old, new))
     ends = horizons(designing.model, (new, old), designing.Ts)
     designing = replace(designing, before=before, ends=ends)

@@ -10,6 +10,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from typing import Unpack
 
 from sqlalchemy.exc import SQLAlchemyError
@@ -184,8 +185,8 @@ class Worker:
             with self._directory.alone_with(row.loop):
                 try:
                     state = self._begun(loop, row)
-                except Locked as locked:  # an earlier attempt is restored already
-                    return Outcome(None, locked, None if row.session is None else loop.read(), {})
+                except (Locked, FalsePv) as ended:  # an earlier attempt is restored already
+                    return Outcome(None, ended, None if row.session is None else loop.read(), {})
             earlier = self.store.events(row.id) if row.found is not None else ()
             hooks = Hooks(
                 running.on_event, running.on_samples, lambda: running.stop_reason, earlier,
@@ -227,6 +228,7 @@ class Worker:
             # No attempt has touched the loop; the state that an earlier one read may have been another tuner's test.
             state = loop.read(beside_tests=True)
             columns: JobColumns = {"old_gains": asdict(state.gains), "found": state_json(state)}
+            self._ask_what_was_found(loop, row.loop)
             if row.found is None:
                 columns["attempt"] = 1
                 self._move(row.id, JobState.RUNNING, **columns)
@@ -238,11 +240,22 @@ class Worker:
         if safe.state is None:
             raise Failed(safe.reason or Reason.NODE_LOST, safe.text)
         if safe.held:
-            raise FalsePv(Reason.BAD_SAMPLE, f"{FALSE_PV_WORDS}: {safe.text}")
+            raise FalsePv(Reason.BAD_SAMPLE, FALSE_PV_WORDS)
         if safe.reason is not None:
             raise Aborted(safe.reason, safe.text)
         self._resumed(row, safe.text)
         return safe.state
+
+    def _ask_what_was_found(self, loop: Loop, tag: str) -> None:
+        """Notes a test that was cut off and has had this loop held, where no look has found that yet: the controller
+        knows it only until the next session."""
+        for earlier in self._lasting(lambda: looked_after.rows(self.store, tag)):
+            if earlier.found is None or earlier.session is None:
+                continue
+            safe = restore_abandoned(loop, loop_state(earlier.found), earlier.session)
+            if safe.held and safe.state is not None:
+                restored, text = state_json(safe.state), safe.text
+                self._lasting(partial(looked_after.home_again, self.store, earlier.id, restored, text, held=True))
 
     def _dry(self, running: Running, row: Job, config: LoopConfig, request: RetuneRequest) -> Outcome:
         if row.state is JobState.QUEUED:
@@ -323,6 +336,7 @@ class Worker:
 
 
 def _with_what_it_left(found: FalsePv, restored: LoopState | None) -> str:
-    """Returns how PV was false, and what the loop is since."""
-    left = "how the loop was left is not confirmed" if restored is None else after_false_pv(restored)
+    """Returns how PV was false, and what the loop was left in."""
+    unknown = "the loop could not be read back: it may be in automatic on this PV, so look at it now"
+    left = unknown if restored is None else after_false_pv(restored)
     return f"{found.detail}; {left}"

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TypeVar
 
-from loopwright.protocol.profile import Order
+from loopwright.protocol.profile import Cause, Order
 from loopwright.protocol.tuner import Tuner, TunerError
 from loopwright.protocol.tuner_session import TunerSession
 from loopwright.service.loops.bus_connection import AGAIN_S, BusConnection
@@ -45,13 +45,13 @@ def restore(connection: BusConnection, home: LoopState, number: int) -> Restored
 
 def hold(connection: BusConnection, number: int) -> bool:
     """Orders the controller to go to manual at the MV before the test, and to stay there after the session of that
-    number. Returns False where the session is over. Raises Ended."""
+    number. Returns False where the session was over before the order came. Raises Ended."""
 
     def order(tuner: Tuner) -> bool:
         if tuner.session:
             tuner.set_renewed_session(number)  # without a question whether to stop: an abort does not come between
         if int(tuner.number("controller_session")) != number:
-            return False
+            return _was_held(tuner, number)
         session = TunerSession(tuner)
         session.take_up(number)
         try:
@@ -59,10 +59,16 @@ def hold(connection: BusConnection, number: int) -> bool:
         except TunerError:
             if session.is_open:
                 raise
-            return False
+            return _was_held(tuner, number)
         return True
 
     return _patiently(connection, order)
+
+
+def _was_held(tuner: Tuner, number: int) -> bool:
+    """Returns whether the session of that number, which is over, was held: the answer to the order may have been lost
+    with it."""
+    return int(tuner.number("controller_session_last")) == number and cause_of(tuner) is Cause.HELD
 
 
 def end_acceptance(connection: BusConnection, number: int, why: Ended | None) -> LoopState:

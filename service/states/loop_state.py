@@ -60,12 +60,14 @@ def differences(state: LoopState, home: LoopState) -> dict[str, str]:
 
 
 def after_false_pv(state: LoopState) -> str:
-    """Returns in words what a loop is after a test that has found PV to be false, and who has to act."""
+    """Returns in words what a loop was left in by a test that has found PV to be false, and who has to act."""
     if state.mode is Mode.AUTOMATIC:
-        return "PV is false, and the loop is in automatic: an operator has to look at it now, and to put it in manual"
+        return (
+            "PV is false, and the loop was left in automatic: an operator has to look at it now, and put it in manual"
+        )
     return (
-        f"PV is false: the loop is in {state.mode.name.lower()} at MV {state.held_mv:.6g}, and nothing controls PV "
-        "until an operator has mended the sensor and puts the loop in automatic"
+        f"PV is false: the loop was left in {state.mode.name.lower()} at MV {state.held_mv:.6g}, and nothing controls "
+        "PV until an operator has mended the sensor and puts the loop in automatic"
     )
 
 

@@ -25,10 +25,12 @@ def check(session: Session, loop: str) -> None:
         raise NotAcknowledged(words(job))
 
 
-def not_acknowledged(session: Session, loop: str | None = None) -> Sequence[JobRow]:
-    """Returns the tests of every host, or of one loop, that nobody has acknowledged, oldest first."""
-    wanted = _not_acknowledged()
-    return session.scalars(wanted if loop is None else wanted.where(JobRow.loop == loop)).all()
+def not_acknowledged(session: Session, loop: str | None = None, lock: bool = False) -> Sequence[JobRow]:
+    """Returns the tests of every host, or of one loop, that nobody has acknowledged, oldest first.
+
+    lock: nobody else changes them or appends to them before this transaction ends."""
+    wanted = _not_acknowledged() if loop is None else _not_acknowledged().where(JobRow.loop == loop)
+    return session.scalars(wanted.with_for_update() if lock else wanted).all()
 
 
 def words(job: JobRow) -> str:

@@ -68,7 +68,7 @@ def dismissed(store: Store, loop: str, by: str) -> list[str]:
     """A person answers for the loop. Returns the ids of the jobs it was looked after for, or that had found its PV to
     be false."""
     with store.writing() as session:
-        false = false_pv.not_acknowledged(session, loop)
+        false = false_pv.not_acknowledged(session, loop, lock=True)
         found = {row.id: row for row in (*_of_loop(session, loop), *false)}
         for row in found.values():
             before = {"look_after": row.look_after, "reason": row.reason}

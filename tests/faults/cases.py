@@ -72,6 +72,8 @@ FAULTS = {
     "pv-gone": Fault("PV is no number for good", do.pv_gone),
     "pv-frozen": Fault("PV stands still within its limits for good", do.pv_false(None), PV_STAGES, needs=NOISY),
     "pv-jumps": Fault("PV jumps within its limits and stays there", do.pv_false(-0.6), PV_STAGES, needs=NOISY),
+    "pv-frozen-clean": Fault("PV without noise stands still for good", do.pv_false(None), PV_STAGES),
+    "pv-jumps-clean": Fault("PV without noise jumps with MV, and stays", do.pv_false(0.6), ("fast-relay",)),
     "two-tuners": Fault(
         "another tuner wants the loop", do.two_tuners, ("relay", "verify", "fast-relay", "setpoint-pulses", "manual-up")
     ),

@@ -4,7 +4,7 @@ The valve stays where it is while the integral of the controller moves MV, and j
 (M. A. A. S. Choudhury, N. F. Thornhill, S. L. Shah, Control Engineering Practice 13, 2005, with S = J): PV of a flow is
 then square and MV triangular, and the level of a vessel saws. Positions of valves that stick by so much are
 followed, and PV is fitted with what a first-order plant, or an integrating one, makes of each, beside what it makes of
-MV itself.
+MV itself, and of MV and a load that goes to and fro, or up and down, as often as such a valve jumps: that looks alike.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 Array = NDArray[np.float64]
 ROWS, MIN_ROWS = 400, 40
@@ -25,8 +24,13 @@ BEGINNINGS = tuple(np.linspace(-0.96, 0.96, 17).tolist())
 """How far from MV the valve may stand at the beginning, in its stiction."""
 LAGS, DEAD_TIMES, LONGEST_LAG, LONGEST_DEAD_TIME = 8, 14, 0.5, 0.25
 """Lags and dead times that are tried, and the longest ones as parts of the record."""
-CLEAR = 1.5
-"""Ratio of the sums of squares left by a sound valve and by one that sticks, above which it sticks."""
+CLEAR, CLEAR_OF_LOADS = 2.0, 1.2
+"""Ratios of the sums of squares left by a sound valve, and by one under such a load, to that of one that sticks, from
+which on it sticks, and up to which a load is not the better explanation: it has one more size, and a dead time of its
+own."""
+SINGULAR = 1e-6
+MIN_LEVELS = 20
+"""Smallest number of values that PV has: rounding alone makes a square of PV and a triangle of MV."""
 MAX_RESIDUAL_NOISES, MAX_RESIDUAL = 1.35, 0.04
 """Largest residual, in standard deviations of the noise and of PV, of a valve that sticks: a load that goes to and fro
 leaves more."""
@@ -91,7 +95,7 @@ def _in_one(Ts: float, mv: Array, pv: Array, noise: float) -> Sticking | None:
     """The same for a stretch of a few cycles."""
     block = math.ceil(len(pv) / ROWS)
     rows = len(pv) // max(block, 1)
-    if rows < MIN_ROWS or not np.ptp(mv) > 0.0:
+    if rows < MIN_ROWS or not np.ptp(mv) > 0.0 or len(np.unique(pv)) < MIN_LEVELS:
         return None
     y = _averaged(pv - pv.mean(), block, rows)
     if np.ptp(y) < 2.0 * MIN_MOVE_NOISES * noise / math.sqrt(block):
@@ -117,6 +121,8 @@ def _in_one(Ts: float, mv: Array, pv: Array, noise: float) -> Sticking | None:
     sound = _left_by(_averaged(mv, block, rows)[None], y, _lags(rows), _delays(rows)).left
     explained = max((MAX_RESIDUAL_NOISES * noise) ** 2 / block, MAX_RESIDUAL**2 * float(np.var(y)))
     if sound < CLEAR * found.left or found.left > rows * explained:
+        return None
+    if found.left > CLEAR_OF_LOADS * _left_by_loads(mv, position, y, block):
         return None
     jumps, turned = np.flatnonzero(np.diff(position)), _turns(position)
     period_s = 2.0 * Ts * (jumps[-1] - jumps[0]) / max(turned - 1, 1)
@@ -160,21 +166,72 @@ class _Fitted:
     delay: float
 
 
+def _left_by_loads(mv: Array, position: Array, y: Array, block: int) -> float:
+    """The least that a sound valve leaves of PV under a load that jumps to and fro, at the plant's input or in PV
+    itself, or goes up and down, as often as this valve turns.
+
+    mv, position: shape (N,). y: PV, averages over `block` samples, shape (rows,).
+    """
+    rows = len(y)
+    jumps = np.sign(np.diff(position, prepend=position[0]))
+    at = np.flatnonzero(jumps)
+    to_and_fro = np.where(np.arange(len(mv)) < at[0], -jumps[at[0]], jumps[at[np.cumsum(jumps != 0.0).clip(1) - 1]])
+    u, square = _averaged(mv - mv[0], block, rows), _averaged(to_and_fro, block, rows)
+    loads = (square, np.cumsum(square - square.mean()))
+    delays = np.unique(np.rint(_delays(rows)).astype(int)).tolist()
+    least = math.inf
+    for T in _lags(rows).tolist():
+        free, of_mv = _free(rows, T), _late(_driven(u, T), delays)
+        wanted = y - free @ (free.T @ y)
+        of_mv -= (of_mv @ free) @ free.T
+        for load in (*(_driven(each - each[0], T) for each in loads), square):
+            of_load = _late(load, delays)
+            of_load -= (of_load @ free) @ free.T
+            least = min(least, _left_by_both(of_mv, of_load, wanted))
+    return least
+
+
+def _left_by_both(first: Array, second: Array, y: Array) -> float:
+    """The least that one of the first and one of the second columns, shape (columns, rows), leave of y together."""
+    a, b = (np.einsum("ij,ij->i", each, each) for each in (first, second))
+    both, ya, yb = first @ second.T, (first @ y)[:, None], (second @ y)[None]
+    determinant = a[:, None] * b - both**2
+    known = determinant > SINGULAR * a[:, None] * b
+    determinant = np.where(known, determinant, math.inf)
+    explained = (ya**2 * b - 2.0 * ya * yb * both + yb**2 * a[:, None]) / determinant
+    return float(y @ y - np.where(known, explained, 0.0).max())
+
+
+def _driven(inputs: Array, T: float) -> Array:
+    """What a plant of gain 1 and this lag, in rows, makes of inputs, shape (..., rows)."""
+    share = 1.0 if math.isinf(T) else -math.expm1(-1.0 / T)
+    from scipy.signal import lfilter  # its import takes 0.4 s
+
+    return np.asarray(lfilter([share], [1.0, -1.0 if math.isinf(T) else share - 1.0], inputs))
+
+
+def _late(values: Array, delays: list[int]) -> Array:
+    """These values, shape (rows,), later by each of these numbers of rows, shape (delays, rows)."""
+    return np.stack([np.concatenate((np.full(each, values[0]), values[: len(values) - each])) for each in delays])
+
+
+def _free(rows: int, T: float) -> Array:
+    """What such a plant does by itself, orthonormal, shape (rows, 2)."""
+    n = np.arange(rows)
+    start = n / rows if math.isinf(T) else np.exp(-n / T)
+    return np.asarray(np.linalg.qr(np.stack((np.ones(rows), start), axis=1))[0])
+
+
 def _left_by(inputs: Array, y: Array, lags: Array, delays: Array) -> _Fitted:
     """The plant driven by one of these inputs that leaves the least of PV.
 
     inputs: shape (inputs, rows). y: shape (rows,). lags, delays: that are tried, in rows.
     """
     rows = len(y)
-    n = np.arange(rows)
     delays = np.unique(np.rint(delays).astype(int))
     best = _Fitted(math.inf, 0, math.inf, 0.0)
     for T in lags.tolist():
-        share = 1.0 if math.isinf(T) else -math.expm1(-1.0 / T)
-        driven = inputs - inputs[:, :1]
-        moved = lfilter([share], [1.0, -1.0 if math.isinf(T) else share - 1.0], driven, axis=1)
-        start = n / rows if math.isinf(T) else np.exp(-n / T)
-        free, _ = np.linalg.qr(np.stack((np.ones(rows), start), axis=1))
+        moved, free = _driven(inputs - inputs[:, :1], T), _free(rows, T)
         wanted = y - free @ (free.T @ y)
         for delay in delays.tolist():
             late = np.concatenate((np.zeros((len(inputs), delay)), moved[:, : rows - delay]), axis=1)

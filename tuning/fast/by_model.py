@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from loopwright.tuning.fast.design import Aim, DesignSpec, aim_of
-from loopwright.tuning.fast.design_trial import designed_on
-from loopwright.tuning.fast.procedure import FAST
 from loopwright.tuning.models import Model
 from loopwright.tuning.rules.registry import ANY, Method, Option
 from loopwright.tuning.rules.setting import Setting
 
 
 def _by_model(model: Model, ms: float = 1.6, derivative: bool = False, aim: str = Aim.BALANCED) -> Setting:
+    from loopwright.tuning.fast.design_trial import designed_on  # and with it the whole procedure
+
     best = designed_on(model, DesignSpec(Ms=ms, derivative=derivative, aim=aim_of(aim)), 0.0)
     return Setting(best.gains, {"Ms": best.Ms})
 
 
 BY_MODEL = Method(
-    FAST,
+    "fast",
     "fast, designed for Ms",
     "docs/fast.md: least IAE under a maximum sensitivity (Astrom, Panagopoulos, Hagglund, Automatica 34, 1998)",
     "Gains as good as the Ms that is asked for permits, for a model that is trusted.",

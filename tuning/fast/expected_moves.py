@@ -30,8 +30,10 @@ SEED = 1
 GAIN_SEEN_BY_PULSES, GAIN_SEEN_IN_MANUAL = 0.85, 0.9
 """The gain that a test may take the plant to have as it sizes its later moves, over what it is: the first response
 shows it to 10 or 20 %."""
-LAST_LEVEL_TURNS = 2.0
-"""How long the last level of the set-point is held, in times of the two turns before it: PV's swing is over by then."""
+LAST_LEVEL_TURNS = (2.0, 0.0, 0.3, 0.7)
+"""How long the last level of the set-point is held, in times of the two turns before it. After the longest PV's swing
+is over. The pulses end as soon as the record tells enough, and the step under the new gains may begin anywhere in that
+swing, which adds to it: the others are such moments."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +69,7 @@ def expected_moves(
     model: Model,
     new: NewGains | None,
     after_pulses: bool = False,
+    last_level_turns: float = LAST_LEVEL_TURNS[0],
 ) -> Plan[None]:
     """The moves of one excitation from rest, with those of the stages that follow it.
 
@@ -74,6 +77,7 @@ def expected_moves(
     model: the model that the moves are driven on.
     new: the gains of the step that follows; None where none does.
     after_pulses: whether the relay follows pulses of the set-point.
+    last_level_turns: how long pulses of the set-point hold their last level, one of LAST_LEVEL_TURNS.
     Raises Refused as the tests do.
     """
     point, trace = rest(facts, noise, Mode.MANUAL if excitation is Excitation.MANUAL else Mode.AUTOMATIC)
@@ -82,7 +86,7 @@ def expected_moves(
             return (yield from _trial(KnownTrial(facts, point, trace, None), new))
         case Excitation.SETPOINT:
             pulses = PulseTest(facts, point, trace)
-            yield from _pulses(pulses, _seen(model, GAIN_SEEN_BY_PULSES))
+            yield from _pulses(pulses, _seen(model, GAIN_SEEN_BY_PULSES), last_level_turns)
             return (yield from _step_home(pulses, model, new))
         case Excitation.MANUAL:
             return (yield from _manual(ManualTest(facts, point, trace), _seen(model, GAIN_SEEN_IN_MANUAL)))
@@ -91,10 +95,8 @@ def expected_moves(
                 relay = RelayTest(facts, point, trace, options.amplitude, begins_with=options.begins_with)
                 return (yield from _relay(relay, new))
             pulses = PulseTest(facts, point, trace)
-            yield from _pulses(pulses, _seen(model, GAIN_SEEN_BY_PULSES))
-            relay = RelayTest(
-                facts, point, pulses.trace, options.amplitude, pulses.listened, options.begins_with
-            )
+            yield from _pulses(pulses, _seen(model, GAIN_SEEN_BY_PULSES), last_level_turns)
+            relay = RelayTest(facts, point, pulses.trace, options.amplitude, pulses.listened, options.begins_with)
             return (yield from _relay(relay, new))
 
 
@@ -122,7 +124,7 @@ def _relay(test: RelayTest, new: NewGains | None) -> Plan[None]:
         yield from test.step_back()
 
 
-def _pulses(test: PulseTest, model: Model) -> Plan[None]:
+def _pulses(test: PulseTest, model: Model, last_level_turns: float) -> Plan[None]:
     yield from _begins(test, "pulses")
     yield from test.start()
     yield from test.until_followed()
@@ -130,7 +132,7 @@ def _pulses(test: PulseTest, model: Model) -> Plan[None]:
     yield from test.until_followed()
     turned_at = test.elapsed
     yield from turn_up(test, [model])
-    yield from test.lasting((1.0 + LAST_LEVEL_TURNS) * turned_at)
+    yield from test.lasting((1.0 + last_level_turns) * turned_at)
     test.period = float(turned_at)
 
 

@@ -17,9 +17,11 @@ from loopwright.tuning.identification.output_error import DisturbanceHypothesis,
 from loopwright.tuning.models import Reals
 
 SIZES = (0.03, 0.06, 0.11, 0.19, 0.31)  # of MV's largest move
-MIN_STICTION = 0.04
-"""Smallest stiction, as a fraction of the largest deviation of MV. A smaller one cannot be told from a plant that is
-none of the structures, and does not change Ms where a test moves MV."""
+SIZES_OF_STICTION = (0.01, 0.014, 0.02, 0.028, *SIZES[1:], 0.04, 0.085, 0.15)
+"""Those of stiction: a level goes on moving for as long as the valve stands a little off."""
+SMALL_STICTION, MIN_BIC_GAIN_OF_SMALL = 0.04, 30.0
+"""The stiction, as a fraction of the largest deviation of MV, below which it must lower BIC by more: a plant that is
+none of the structures looks a little like it."""
 SATURATIONS, MAX_SATURATION = (0.55, 0.7, 0.85), 0.96
 FIRST_STEPS, STEPS = 4, 10
 REFINED = (1.25, 1.1, 1.04)
@@ -67,7 +69,7 @@ Fault = Callable[[Reals, float], Reals]
 
 FAULTS: dict[Fault, tuple[tuple[float, ...], str]] = {
     backlash: (SIZES, "a valve that follows about {:.2g} of MV behind"),
-    stiction: (SIZES, "a valve that sticks until MV is off by about {:.2g}"),
+    stiction: (SIZES_OF_STICTION, "a valve that sticks until MV is off by about {:.2g}"),
     saturation: (SATURATIONS, "an actuator that goes about {:.2g} of MV far"),
 }
 
@@ -75,7 +77,7 @@ FAULTS: dict[Fault, tuple[tuple[float, ...], str]] = {
 def find_valve_fault(fit: Fit[ExperimentRecord], best: Fitted) -> ValveFault | None:
     """The valve fault that explains the record clearly better than the best model without one, None if there is none.
 
-    A fault must lower BIC by more than MIN_BIC_GAIN.
+    A fault must lower BIC by more than MIN_BIC_GAIN, a small stiction by more than MIN_BIC_GAIN_OF_SMALL.
     """
     structure, record = best.structure, fit.record
     # The position of the valve within its backlash is unknown at rest; it acts as a load disturbance from the start of
@@ -96,14 +98,13 @@ def find_valve_fault(fit: Fit[ExperimentRecord], best: Fitted) -> ValveFault | N
         sizes = [each for each in (size / factor, size * factor) if fault is not saturation or each <= MAX_SATURATION]
         near = [(fitted_with(fault, each, found.theta, FIRST_STEPS), fault, each) for each in sizes]
         found, fault, size = min([(found, fault, size), *near], key=_bic)
-    if fault is stiction and size < MIN_STICTION:
-        return None
     found = fitted_with(fault, size, found.theta, STEPS)
     # The free load disturbance alone may explain as much, as MV at rest is known only within the noise. So may the
     # better start, as the best fit may be a local minimum. The perfect valve is therefore fitted with both.
     sound = fit.search(structure, slack, [start, found.theta], FIRST_STEPS + STEPS)
     gain = min(best.bic, sound.bic) - found.bic
-    return ValveFault(FAULTS[fault][1].format(size * record.input_range), gain) if gain > MIN_BIC_GAIN else None
+    least = MIN_BIC_GAIN_OF_SMALL if fault is stiction and size < SMALL_STICTION else MIN_BIC_GAIN
+    return ValveFault(FAULTS[fault][1].format(size * record.input_range), gain) if gain > least else None
 
 
 def _with_fault(record: ExperimentRecord, fault: Fault, size: float) -> ExperimentRecord:

@@ -72,6 +72,8 @@ def with_what_hides(refused: Refused, record: ExperimentRecord, pv: Reals, mv_at
     swings = oscillation_at_rest(without_wrong_samples(pv)[rest], record.u[rest] + mv_at_rest, record.Ts, SHOWS)
     if swings is not None and swings.by_window:
         return Refused(Reason.MV_ALTERED, swings.in_words)
+    if not record.period:  # the test ended before the record had a time scale, which a fit needs
+        return refused
     fit = Fit(record)
     fault = find_mv_fault(fit, choose_structure(fit).best, mv_at_rest)
     if fault is not None:

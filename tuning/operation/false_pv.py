@@ -1,5 +1,5 @@
 """Whether PV of a loop in operation is false: it stands still where it never did, or has jumped and stays, as no plant
-of that speed does. The rules are those of tests (`tuning.experiments.false_pv`); what PV did before takes the place of
+of that speed does. The rules are those of tests (`tuning.experiments`); what PV did before takes the place of
 its rest."""
 
 from __future__ import annotations
@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopwright.tuning.experiments.false_pv import JUMP_BAND, JUMP_MOVES, JUMP_NOISES, JUMP_STAYS, PvAtRest
+from loopwright.tuning.experiments.pv_at_rest import PvAtRest
+from loopwright.tuning.experiments.pv_jump import JUMP_BAND, JUMP_MOVES, JUMP_NOISES, JUMP_STAYS
 from loopwright.tuning.models import Reals
 
 MIN_BEFORE = 100

@@ -78,20 +78,25 @@ def unconfirmed(**changes: object) -> UnconfirmedJob:
 
 
 @pytest.mark.parametrize(
-    ("mode", "words"),
+    ("mode", "reason", "words", "first"),
     [
-        (Mode.MANUAL, "it stood still; the loop was left in manual at MV 42.5 %"),
-        (Mode.AUTOMATIC, "it stood still; the loop was left in automatic"),
-        (None, "it stood still; the loop could not be read back"),
+        (Mode.MANUAL, Reason.PV_FROZEN, "was left in manual at MV 42.5 %", "Check the sensor"),
+        (Mode.OFF, Reason.BAD_SAMPLE, "was left in off at MV 41 %", "Check the sensor"),
+        (Mode.AUTOMATIC, Reason.PV_FROZEN, "was left in automatic", "Look at the loop now: unless somebody has put it"),
+        (None, Reason.PV_FROZEN, "could not be read back", "Look at the loop now: it may be in automatic"),
+        (Mode.MANUAL, Reason.NODE_LOST, "was left in manual at MV 42.5 %", "Check the sensor"),  # found held only later
     ],
 )
-def test_a_false_pv_is_an_alarm_at_once_which_says_what_the_loop_was_left_in(mode: Mode | None, words: str) -> None:
+def test_a_false_pv_is_an_alarm_at_once_which_says_what_the_loop_was_left_in(
+    mode: Mode | None, reason: Reason, words: str, first: str
+) -> None:
     state = None if mode is None else LoopState(mode, 50.0, 50.0, 41.0, OLD, False, 0.0, 100.0, 0.1, True, 42.5)
-    found = FalsePvJob("4f0c2a9be113", "A", "gw-2", AT, Reason.PV_FROZEN, None if state is None else state_json(state))
-    known = facts(false_pvs=(found,), tests=(job(JobState.FAILED, Reason.PV_FROZEN),))
+    found = FalsePvJob("4f0c2a9be113", "A", "gw-2", AT, reason, None if state is None else state_json(state))
+    known = facts(false_pvs=(found,), tests=(job(JobState.FAILED, reason),))
     ((alarm,), (later,)) = steps(known, 0.0, 1e6)
     assert (alarm.level, alarm.kind, alarm.loops, alarm.host) == (1, AlarmKind.FALSE_PV, ["A"], "gw-2")
-    assert alarm.text == f"PV was found to be false in a test: {words}"
+    assert alarm.text == f"PV was found to be false in a test; the loop {words}"
+    assert alarm.advice.startswith(first) and "when PV is right again" in alarm.advice
     assert "No test begins until somebody signs this off" in alarm.advice and alarm.to_sign
     assert later == alarm, "it is the only alarm of that test"
     assert not conditions(replace(known, false_pvs=(), signed=frozenset({alarm.id}))), "nor is there one afterwards"

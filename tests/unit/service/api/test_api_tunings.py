@@ -131,8 +131,8 @@ def test_the_slow_method_on_request(service: Service, client: TestClient) -> Non
 def test_unstable_gains_are_not_to_be_tried(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from loopwright.tuning import tuned as module
     from loopwright.tuning.analysis.assessment import assess
+    from loopwright.tuning.fast import tuned as module
 
     # a hundred times the gains that the method found
     monkeypatch.setattr(module, "realisable", lambda gains, _filter: (Gains(100.0 * gains.Kp, gains.Ti), ()))

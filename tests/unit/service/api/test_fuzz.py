@@ -190,7 +190,7 @@ def test_what_the_document_allows(label: str, site: Site) -> None:
             if label in RETUNES_MANY:
                 case.body.pop("loops", None)
                 case.body["pattern"] = "*"
-            if label in RETUNES:
+            if label in RETUNES and isinstance(case.body, dict):
                 case.body["requested_by"] = "M. Weber"  # no key names the caller
             case.body = case.body if body is None else body
             case.path_parameters.update({k: v for k, v in names.items() if k in case.path_parameters})

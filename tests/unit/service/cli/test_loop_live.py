@@ -25,6 +25,7 @@ ROW: dict[str, Any] = {
 JOB: dict[str, Any] = {
     "id": "4f0c2a9be113", "url": "/jobs/4f0c2a9be113", "loop": "TIC-101", "host": "local", "state": "running",
     "dry_run": False, "requested_by": "me", "stage": "relay", "progress": 0.42, "remaining_plant_time_s": 31.2,
+    "remaining_wall_time_s": 31.2,
     "plant_time_s": 22.7, "stopping": False,
 }  # fmt: skip
 

@@ -96,7 +96,7 @@ def test_success_gives_the_value_and_the_stage_times() -> None:
         (lambda s: s._replace(pv=math.nan), Reason.BAD_SAMPLE),
         (lambda s: s._replace(mv=math.inf), Reason.BAD_SAMPLE),
         (lambda s: s._replace(t=s.t + 1.0), Reason.SAMPLES_LOST),
-        (lambda s: s._replace(pv=5.0), Reason.PV_LIMIT),
+        (lambda s: s._replace(pv=s.pv + 2.0 * (s.t - 9.8)), Reason.PV_LIMIT),
     ],
 )
 @pytest.mark.parametrize("plan", [trial, relay])
@@ -289,6 +289,58 @@ def test_a_frozen_pv_is_noticed_once_mv_has_moved_and_the_loop_is_held() -> None
     assert (state.mode, state.manual_output, state.sp) == (Mode.MANUAL, 0.0, 0.0)
     assert (state.gains, state.on_trial) == (OLD, False)
     assert ["PV is false: PV" in notes[0], "in manual at MV 0" in notes[1]] == [True, True], notes
+
+
+def test_a_defect_in_the_way_to_HOLD_keeps_no_loop_from_being_restored() -> None:
+    class Defective(Meddled):
+        def hold(self) -> None:
+            raise ValueError("no")
+
+    def plan() -> Plan[None]:
+        yield ()
+        raise FalsePv(Reason.BAD_SAMPLE, "PV went from 1 to 2")
+
+    notes: list[str] = []
+    result = run(
+        plan(), Defective(), limits=RunLimits(),
+        on_event=lambda e: notes.append(e.text) if isinstance(e, Note) else None,
+    )  # fmt: skip
+    assert isinstance(result.ended, FalsePv) and result.restored is not None
+    assert "could not be held, by a defect: ValueError('no')" in notes[1]
+
+
+@pytest.mark.parametrize(("wrong", "kind", "reason"), [(2, Failed, "pv_limit"), (10**9, FalsePv, "bad_sample")])
+def test_a_pv_that_jumps_beyond_its_limits_is_looked_at_until_it_is_known_to_stay(
+    wrong: int, kind: type[Failed], reason: str
+) -> None:
+    left = [wrong]
+
+    def jumped(s: Sample) -> Sample:
+        left[0] -= 1
+        return s._replace(pv=-5.0) if left[0] >= 0 else s
+
+    loop = Meddled(100, jumped)
+    result = run(trial(), loop, limits=RunLimits(pv_low=-4.0, pv_high=4.0))
+    assert (type(result.ended), result.ended and result.ended.reason.value) == (kind, reason)
+    assert loop.read().mode is (Mode.MANUAL if kind is FalsePv else Mode.AUTOMATIC)
+
+
+def test_a_refusal_on_a_pv_that_never_answered_leaves_the_loop_held() -> None:
+    """A PV without noise that is as before the test, whatever MV does: the sensor may have ended."""
+
+    def waits() -> Plan[None]:
+        for _ in range(60):
+            yield ()
+        yield (SetRelay(0.5, 0.0, 0.0), SetMode(Mode.EXPERIMENT))
+        for _ in range(200):
+            yield ()
+        raise Refused(Reason.NO_RESPONSE, "PV did not move")
+
+    loop = Meddled(0, lambda s: s._replace(pv=0.0))
+    result = run(waits(), loop, limits=RunLimits())
+    assert isinstance(result.ended, FalsePv) and result.ended.reason is Reason.PV_FROZEN
+    assert "without that: no_response" in result.ended.detail
+    assert loop.read().mode is Mode.MANUAL
 
 
 def test_a_false_pv_stays_the_reason_where_the_loop_cannot_be_held_or_read_back() -> None:

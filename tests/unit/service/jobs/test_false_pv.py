@@ -69,7 +69,7 @@ def test_the_job_says_what_the_loop_is_and_who_has_to_act(service: Service) -> N
     job = ended(service)
     assert (job.state, job.reason, job.false_pv, job.look_after) == (JobState.FAILED, Reason.PV_FROZEN, True, False)
     assert job.restored is not None and (job.restored["mode"], job.restored["manual_output"]) == ("manual", 40.0)
-    assert "10 samples; PV is false: the loop is in manual at MV 40" in (job.detail or "")
+    assert "10 samples; PV is false: the loop was left in manual at MV 40" in (job.detail or "")
     assert "until an operator has mended the sensor and puts the loop in automatic" in (job.detail or "")
     assert (service.controller.state.mode, service.controller.state.gains) == (Mode.MANUAL, OLD)
 
@@ -78,7 +78,7 @@ def test_no_test_begins_until_a_person_has_acknowledged_it(service: Service, cli
     job = ended(service)
     assert f"job {job.id} found PV of loop {TAG} to be false" in refused(service)
     assert f"loopwright dismiss {TAG}" in refused(service)
-    answer = client.post(f"/loops/{TAG}/retune", json={})
+    answer = client.post(f"/loops/{TAG}/retune", json={"requested_by": "A. Lind"})
     assert (answer.status_code, answer.json()["reason"]) == (409, "not_acknowledged")
     assert f"loopwright dismiss {TAG}" in answer.json()["detail"] and job.id in answer.json()["detail"]
     preview = client.post(f"/loops/{TAG}/retune/preview", json={}).json()
@@ -136,7 +136,8 @@ def test_a_job_that_waits_for_its_turn_is_refused(service: Service) -> None:
 
 def test_a_batch_leaves_the_loop_out_and_says_why(service: Service, client: TestClient) -> None:
     job = ended(service)
-    url = client.post("/retunes", json={"loops": [TAG], "stop_after_failures": 1}).json()["url"]
+    asked = {"loops": [TAG], "stop_after_failures": 1, "requested_by": "A. Lind"}
+    url = client.post("/retunes", json=asked).json()["url"]
     until(lambda: client.get(url).json()["ended_at"] is not None, "the end of the batch")
     found = client.get(url).json()
     (part,) = found["loops"]
@@ -160,7 +161,7 @@ def test_a_kill_between_HOLD_and_the_end_of_the_job_ends_it_so(
     job = service.store.get(job_id)
     assert (job.state, job.reason, job.false_pv) == (JobState.FAILED, Reason.BAD_SAMPLE, True), job.detail
     assert job.restored is not None and job.restored["mode"] == "manual"
-    assert "the loop is in manual at MV 40" in (job.detail or "")
+    assert "the loop was left in manual at MV 40" in (job.detail or "")
     assert (service.controller.state.mode, service.controller.session) == (Mode.MANUAL, 0)
     assert job_id in refused(service)
 
@@ -219,3 +220,21 @@ def test_a_loop_that_is_found_held_only_later_is_to_be_acknowledged_too(service:
     assert (found.look_after, found.false_pv) == (False, True)
     assert found.restored is not None and found.restored["mode"] == "manual"
     assert job_id in refused(service)
+
+
+def test_a_test_that_is_asked_for_before_that_look_finds_it_out_itself(service: Service) -> None:
+    """The service was killed after HOLD, and the node was away at its next start."""
+    service.tune.ends = None
+    job_id = service.under_test()
+    service.controller.hold()
+    service.controller.absent = Reason.NODE_LOST
+    service.tune.hold.set()
+    service.wait(job_id)
+    service.controller.absent = None
+    later = service.jobs.start(TAG, FastRetune())
+    service.wait(later.id)
+    found = service.store.get(later.id)
+    assert (found.state, found.reason, found.session) == (JobState.REFUSED, Reason.NOT_ACKNOWLEDGED, None), found.detail
+    earlier = service.store.get(job_id)
+    assert (earlier.look_after, earlier.false_pv) == (False, True)
+    assert service.controller.state.mode is Mode.MANUAL

@@ -8,14 +8,15 @@ from dataclasses import replace
 
 import pytest
 
-from loopwright.protocol.objects import lookup
-from loopwright.protocol.profile import TUNER_NODE, Cause, NmtCommand, Order
+from loopwright.protocol.objects import Value, lookup
+from loopwright.protocol.profile import TUNER_NODE, Abort, Cause, NmtCommand, Order
+from loopwright.protocol.sdo import SdoAbort
 from loopwright.protocol.session import object_of
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.plan import Mode, Note, Plan, SetGains, SetMode, SetOutput, SetSetpoint
-from loopwright.tuning.reasons import Failed, FalsePv, Reason
+from loopwright.tuning.reasons import Ended, Failed, FalsePv, Reason
 from tests.unit.service.bus_site import NEW, RELAY, Killed, Site
 
 LIMITS = RunLimits(40.0, 60.0, 0.0, 100.0)
@@ -76,7 +77,7 @@ def test_the_loop_is_left_in_manual_at_the_MV_of_the_rest(pace: float, first: tu
     assert (result.restored.mode, result.restored.gains) == (Mode.MANUAL, before.gains)
     assert result.restored.manual_output == pytest.approx(before.mv, abs=0.5)
     assert site.controller.sessions[0].cause is Cause.HELD
-    assert any("in manual at MV" in note and "operator" in note for note in notes), notes
+    assert any("left in manual at MV" in note and "operator" in note for note in notes), notes
     if pace:
         assert is_held(site)
 
@@ -165,7 +166,7 @@ def test_an_operator_who_was_faster_has_the_last_word() -> None:
     assert result.ended is FROZEN
     assert site.is_home(50.25), "in automatic, as the operator's command has left it"
     assert any("could not be held" in note and "set-point" in note for note in notes), notes
-    assert any("the loop is in automatic: an operator has to look" in note for note in notes), notes
+    assert any("the loop was left in automatic: an operator has to look" in note for note in notes), notes
 
 
 def test_a_bus_that_is_away_for_a_moment_does_not_keep_it_from_being_held() -> None:
@@ -203,3 +204,56 @@ def test_another_tuner_may_test_a_held_loop_and_its_home_is_manual() -> None:
     false_pv(site)
     _, other = site.another(TUNER_NODE - 1)
     assert other.begin().mode is Mode.MANUAL
+
+
+def test_HOLD_whose_answer_is_lost_with_the_session_is_known_to_have_come() -> None:
+    """The controller is stopped the moment it has taken the order: the session is over, and held."""
+    site = Site()
+    home, _ = site.begun()
+    site.loop.step((RELAY,))
+    writes, name = site.controller.dictionary.on_write, object_of(Order.HOLD)
+    carry_out = writes[name]
+
+    def order(sub: int, value: Value) -> None:
+        carry_out(sub, value)
+        site.controller.sessions[0].end(Cause.LEASE)
+        raise SdoAbort(Abort.DEVICE_STATE)
+
+    writes[name] = order
+    site.loop.hold()
+    assert site.loop.restore(home).held and is_held(site)
+
+
+def test_HOLD_given_twice_is_one_and_nothing_moves_the_loop_after_it() -> None:
+    site = Site()
+    home, _ = site.begun()
+    site.loop.step((RELAY,))
+    site.loop.hold()
+    site.loop.hold()
+    with pytest.raises(Ended):
+        site.loop.step((SetMode(Mode.AUTOMATIC),))
+        site.loop.step((SetMode(Mode.AUTOMATIC),))
+    assert site.channel.mode == Mode.MANUAL
+    assert site.loop.restore(home).held and is_held(site)
+
+
+def test_a_session_that_is_over_when_HOLD_comes_is_said_to_have_ended_in_automatic() -> None:
+    """The heartbeat was missing for too long: home is as before, and nothing says that the loop is held."""
+    site = Site()
+    result, notes, _ = false_pv(site, (RELAY,), lambda: site.pass_time(30.0))
+    assert result.ended is FROZEN and result.restored is not None
+    assert result.restored.mode is Mode.AUTOMATIC and site.is_home()
+    assert any("could not be held" in note for note in notes), notes
+    assert any("left in automatic" in note for note in notes) and not any("in manual at MV" in note for note in notes)
+
+
+def test_HOLD_of_one_channel_leaves_the_other_alone() -> None:
+    site = Site(channels=2)
+    site.let_run()
+    second = site.tuner(site.gateway, channel=2)
+    home = second.begin()
+    second.step((RELAY,))
+    second.hold()
+    assert second.restore(home).held
+    assert [each.channel.mode for each in site.controller.sessions] == [Mode.AUTOMATIC, Mode.MANUAL]
+    assert [each.cause for each in site.controller.sessions] == [Cause.NONE, Cause.HELD]

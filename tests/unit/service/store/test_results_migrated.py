@@ -46,7 +46,7 @@ def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
     """The golden job with what is shown of it since: nobody has decided, a live test knows how fast it sampled, in
     which mode it found the loop, and whether its gains were tried; it has no samples. How late a second path would have
     shown is not known. Gains were tried with b = 1.
-    No settling time and no movement of MV were asked for, nor was the latter computed.
+    No settling time and no movement of MV were asked for, nor was the latter computed, nor a delay margin.
     Its advice is not stored, but today's for its reason."""
     advice = None if golden["reason"] is None else ADVICE[Reason(golden["reason"])]
     sample_time_s = None if golden["dry_run"] else 0.1
@@ -54,7 +54,7 @@ def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
     tried = bool(golden["after"] or golden["verification"]) if proposed_live else None
     model = golden["model"]
     if model is not None and "num" in model:
-        model = model | {"covariance": None}
+        model = model | {"covariance": None, "integrating": False}
     verification = golden["verification"] and golden["verification"] | {"b": 1.0}
     return golden | {
         "comparison": golden["comparison"] and _compared(golden["comparison"]),
@@ -71,12 +71,14 @@ def with_later_fields(golden: dict[str, Any]) -> dict[str, Any]:
         "mode_found": None if golden["dry_run"] else "automatic",
         "tried": tried,
         "record": "none",
+        "remaining_wall_time_s": 0.0,
         "evidence": golden["evidence"] and {**golden["evidence"], "longest_delay_seen_s": None},
     }
 
 
 def _compared(comparison: dict[str, Any]) -> dict[str, Any]:
     def loop(found: dict[str, Any]) -> dict[str, Any]:
+        found = found | {"delay_margin_s": None}
         return found | {step: found[step] and {**found[step], "mv_peak": None} for step in ("setpoint", "load")}
 
     asked = {"settling_s_asked": None, "mv_peak_asked": None, "noise_gain_asked": None}
@@ -84,7 +86,8 @@ def _compared(comparison: dict[str, Any]) -> dict[str, Any]:
 
 
 def shown(store: Store, job_id: str) -> dict[str, Any]:
-    return job_view(store.get(job_id), store.events(job_id), None).model_dump(mode="json")
+    """Without its links, which are no figures."""
+    return job_view(store.get(job_id), store.events(job_id), None).model_dump(mode="json", exclude={"links"})
 
 
 @pytest.mark.parametrize("name", GOLDEN["jobs"])

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from loopwright.tuning.experiments.false_pv import PvAtRest, PvWatch, check_end_of_rest
+from loopwright.tuning.experiments.false_pv import PvWatch
+from loopwright.tuning.experiments.pv_at_rest import PvAtRest, check_end_of_rest
 from loopwright.tuning.reasons import FalsePv, Reason
 
 AT, NOISE, REST = 60.0, 0.05, 100

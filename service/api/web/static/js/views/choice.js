@@ -203,8 +203,8 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   const noTrialIn = mode === "manual" ? "in manual" : mode === "off" ? "off" : "";
   const backButton = html`<button key="back" onClick=${() => { close(); back(); }}>Back to Ms ${msText(tested)}</button>`;
   let inside = null;
-  if (loop.locked) inside = html`<span class="say">Locked by ${loop.locked.by}: no decision until it is unlocked.</span>`;
-  else if (job.dry_run) inside = html`<span class="say">A rehearsal: nothing was moved, and there is nothing to accept.</span>`;
+  if (job.dry_run) inside = html`<span class="say">A rehearsal: nothing was moved, and there is nothing to accept.</span>`;
+  else if (loop.locked) inside = html`<span class="say">Locked by ${loop.locked.by}: no decision until it is unlocked.</span>`;
   else if (!may.operate.value) inside = html`<span class="say">${job.state === "proposed" ? "The loop runs on its old gains. To accept the new ones needs the scope operate." : ""}</span>`;
   else if (pending) inside = html`<span class="say" role="status">${decisionRequestWords(request, loop.host)}</span>`;
   else if (asking === "accept") inside = html`<span class="say">Write <b>${written}</b> into ${where}, for good.</span><label key="itself" class="itself"><input type="checkbox" checked=${byItself} onChange=${(/** @type {any} */ e) => setByItself(e.target.checked)} /> Put the old gains back by itself if, while the loop is watched, PV leaves its limits or an oscillation grows</label>${Signed(`Write to ${loop.tag}`, () => send(() => command(`${job.url}/accept`, { ...by(), roll_back_by_itself: byItself })))}`;

@@ -51,7 +51,7 @@ function trustWords(job) {
 function After(loop, job) {
   const r = job.restored;
   if (!r) return html`<p><b>The loop could not be read back: look at the controller.</b></p>`;
-  return html`<p class="quiet">The loop is in ${r.mode}, set-point ${withUnit(fixed(r.sp, pvDecimals(loop.pv_limits)), unit(loop.pv_unit))}${r.gains ? `, Kp ${significant(r.gains.Kp)}, Ti ${significant(r.gains.Ti)} s` : ""}, read back.</p>`;
+  return html`<p class="quiet">The loop was left in ${r.mode}${r.mode === "manual" ? ` at MV ${withUnit(fixed(r.manual_output, 1), "%")}` : ""}, set-point ${withUnit(fixed(r.sp, pvDecimals(loop.pv_limits)), unit(loop.pv_unit))}${r.gains ? `, Kp ${significant(r.gains.Kp)}, Ti ${significant(r.gains.Ti)} s` : ""}, read back.</p>`;
 }
 
 /** @param {any} loop @param {any} job */

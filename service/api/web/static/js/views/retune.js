@@ -45,15 +45,18 @@ export function RetuneForm({ loop, onClose, onStarted }) {
   useEffect(() => {
     if (bad) return;
     const stop = new AbortController();
-    const look = async () => {
+    const url = `/loops/${encodeURIComponent(loop.tag)}/retune/preview`;
+    const look = async (changed = false) => {
       try {
-        setPreview(await askWith(`/loops/${encodeURIComponent(loop.tag)}/retune/preview`, JSON.parse(asked), stop.signal));
+        // how far PV goes takes a computation: what else is known does not wait for it
+        if (changed) setPreview({ ...(await askWith(`${url}?pv=false`, JSON.parse(asked), stop.signal)), computing: true });
+        setPreview(await askWith(url, JSON.parse(asked), stop.signal));
         setUnclear(null);
       } catch (error) {
         if (!stop.signal.aborted) setUnclear(error);
       }
     };
-    const timer = setTimeout(look, 200);
+    const timer = setTimeout(() => void look(true), 200);
     const again = setInterval(() => {
       if (!document.hidden && !isSilent.peek()) void look();
     }, inTheWay ? SOON_MS : LATER_MS);
@@ -182,7 +185,7 @@ function What(p, loop) {
       ? html`PV is expected between <b>${fixed(p.pv_low, decimals)} and ${pv(p.pv_high)}</b>, by ${p.pv_known_by}.`
       : moving.some(hasPv)
         ? html`How far PV goes is known of some stages alone, by ${p.pv_known_by}: ${moving.filter(hasPv).map((/** @type {any} */ each, /** @type {number} */ n) => html`${n ? ", " : ""}${each.stage} <b>${fixed(each.pv_low, decimals)} to ${pv(each.pv_high)}</b>`)}.`
-        : "How far PV goes is not known beforehand: no model of this loop tells it."}</p>
+        : p.computing ? "How far PV goes is being computed…" : "How far PV goes is not known beforehand: no model of this loop tells it."}</p>
     <p key="ends">It ends by itself if PV leaves <b>${fixed(p.watched.pv.low, Math.min(3, decimals))} … ${pv(p.watched.pv.high)}</b>, if anybody else moves the loop, or when you abort. Then, as at its end, the loop has its mode, ${manual ? "manual output" : "set-point"} and gains back. New gains are a proposal until you accept them.</p>
     <p key="time" class="quiet">It takes ${duration(p.duration_low_s)} to ${duration(p.duration_high_s)} of plant time, estimated from ${p.duration_basis}.</p>`;
 }

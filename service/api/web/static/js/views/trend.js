@@ -34,7 +34,7 @@ export function Trend({ loop, job, height, onJob }) {
   const held = useRef(/** @type {any} */ (null));
   if (!held.current) {
     held.current = {
-      ring: new Ring(), window_s: 120, test: false, zoom: null, stages: [], job: null, dirty: true, pace: 1, begun_s: NaN,
+      ring: new Ring(), window_s: 120, test: false, zoom: null, stages: [], job: null, dirty: true, pace: 1, begun_s: NaN, whole_plant_s: 0,
       chosen: signal("2 min"), zoomed: signal(false), at: signal(/** @type {any} */ (null)),
     };
   }
@@ -44,6 +44,7 @@ export function Trend({ loop, job, height, onJob }) {
     it.began_s = now_s.peek() - (job.plant_time_s ?? 0);
     it.begun_s = NaN;
     it.pace = 1;
+    it.whole_plant_s = 0; // of the test; the pace is known a little later
     it.stages = [];
     it.test = true;
     it.zoom = null;
@@ -125,10 +126,10 @@ export function Trend({ loop, job, height, onJob }) {
       let x = [end - it.window_s, end];
       if (it.zoom) x = it.zoom;
       else if (it.test && it.began_s) {
-        const remaining = it.ended_s ? 0 : (it.job?.remaining_plant_time_s ?? 20) / it.pace;
-        const to = it.ended_s ? Math.max(it.ended_s, it.began_s + 5) + 5 : Math.max(end + remaining, it.began_s + 10);
-        it.test_end_s = it.ended_s ? to : Math.max(to, (it.test_end_s ?? 0) > end ? it.test_end_s : 0);
-        x = [it.began_s - 2, it.ended_s ? to : it.test_end_s];
+        const passed = it.pace * (end - it.began_s);
+        const whole = Math.max(passed + (it.job?.remaining_plant_time_s ?? 20), 10);
+        it.whole_plant_s = Math.max(whole, it.whole_plant_s > passed ? it.whole_plant_s : 0);
+        x = [it.began_s - 2, it.ended_s ? Math.max(it.ended_s, it.began_s + 5) + 5 : it.began_s + it.whole_plant_s / it.pace];
       }
       const data = it.ring.since(x[0]);
       it.data = data;
