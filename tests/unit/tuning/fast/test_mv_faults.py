@@ -122,3 +122,14 @@ def test_another_oscillation_at_rest_is_no_window_and_noise_is_none() -> None:
     oscillation = oscillation_at_rest(0.5 * np.sin(2.0 * np.pi * t / 9.0) + noise, np.full(200, REST), TS)
     assert oscillation is not None and not oscillation.by_window and "9" in oscillation.in_words
     assert oscillation_at_rest(noise, np.full(200, REST), TS) is None
+
+
+@pytest.mark.parametrize("on_for", [0.2, 0.25])
+def test_a_load_that_goes_on_and_off_by_itself_is_no_window(on_for: float) -> None:
+    plant = LinearPlant((0.8,), (30.0, 1.0), 6.0, TS, noise_std=NOISE, seed=1)
+    pv = []
+    for k in range(1200):
+        pv.append(plant.pv)
+        plant.step(12.0 * (k / 34.0 % 1.0 < on_for))
+    oscillation = oscillation_at_rest(np.array(pv[-300:]), np.full(300, REST), TS)
+    assert oscillation is not None and not oscillation.by_window and "17" in oscillation.in_words
