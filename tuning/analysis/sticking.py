@@ -84,8 +84,8 @@ def find_sticking(Ts: float, mv: Array, pv: Array) -> Sticking | None:
     off = mv - mv.mean()
     crossed = np.flatnonzero(np.diff(np.sign(off[np.abs(off) > CROSSED * np.ptp(mv)])))
     stretches = min(max(len(crossed) // HALF_CYCLES, 1), MAX_STRETCHES)
-    at_most = HALF_CYCLES * len(mv) // max(len(crossed), HALF_CYCLES)
-    parts = [slice(int(at), int(at) + at_most) for at in np.linspace(0, len(mv) - at_most, stretches)]
+    length = HALF_CYCLES * len(mv) // max(len(crossed), HALF_CYCLES)
+    parts = [slice(int(at), int(at) + length) for at in np.linspace(0, len(mv) - length, stretches)]
     found = [each for part in parts if (each := _in_one(Ts, mv[part], pv[part], noise)) is not None]
     found.sort(key=lambda each: each.size)
     return found[len(found) // 2] if len(found) >= 0.5 * stretches else None
@@ -179,7 +179,7 @@ def _left_by_loads(mv: Array, position: Array, y: Array, block: int) -> float:
     u, square = _averaged(mv - mv[0], block, rows), _averaged(to_and_fro, block, rows)
     loads = (square, np.cumsum(square - square.mean()))
     delays = np.unique(np.rint(_delays(rows)).astype(int)).tolist()
-    least = math.inf
+    smallest = math.inf
     for T in _lags(rows).tolist():
         free, of_mv = _free(rows, T), _late(_driven(u, T), delays)
         wanted = y - free @ (free.T @ y)
@@ -187,8 +187,8 @@ def _left_by_loads(mv: Array, position: Array, y: Array, block: int) -> float:
         for load in (*(_driven(each - each[0], T) for each in loads), square):
             of_load = _late(load, delays)
             of_load -= (of_load @ free) @ free.T
-            least = min(least, _left_by_both(of_mv, of_load, wanted))
-    return least
+            smallest = min(smallest, _left_by_both(of_mv, of_load, wanted))
+    return smallest
 
 
 def _left_by_both(first: Array, second: Array, y: Array) -> float:

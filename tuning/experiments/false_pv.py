@@ -32,7 +32,7 @@ multiple of the variance at rest, without the OUTLIERS_BETWEEN largest (which a 
 that of the distance from the median the second one, without the OUTLIERS farthest. Of white noise the first is met by
 chance once in 1e5, whatever way PV moves. Lower ones took a true PV at its turning points for false."""
 OUTLIERS_BETWEEN, OUTLIERS = 4, 3
-MOST_SELDOM = 4
+LONGEST_RENEWAL = 4
 """Number of samples from one value to the next from which on the way of PV may look like noise."""
 WHITE = 0.6
 """Smallest ratio of von Neumann of noise around a PV that stands still, without the two largest differences; it is far
@@ -229,7 +229,7 @@ class PvWatch:
             variance = (squares[-1] - squares[-1 - window] - total * total / window) / (window - 1)
             if variance < least:
                 self._false_noise(pv, window, math.sqrt(max(variance, 0.0)))
-        if count >= LOUD_WINDOW and not self._jumps.looking and rest.renewal <= MOST_SELDOM:
+        if count >= LOUD_WINDOW and not self._jumps.looking and rest.renewal <= LONGEST_RENEWAL:
             self._check_loud(pv)
 
     def _check_loud(self, pv: float) -> None:
