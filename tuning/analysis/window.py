@@ -41,7 +41,7 @@ def switched(mv: Reals, length: float, begin: float, latched: bool) -> Reals | N
     mv: absolute, MV units, shape (N,). length, begin: of the window, and where one begins, samples.
     latched: each window takes MV at its beginning; otherwise as it is.
     """
-    low, high = _span(mv)
+    low, high = _range(mv)
     if not low < high:
         return None
     n = np.arange(float(len(mv)))
@@ -57,7 +57,7 @@ def switched(mv: Reals, length: float, begin: float, latched: bool) -> Reals | N
     return np.asarray(low + (high - low) * found)
 
 
-def _span(mv: Reals) -> tuple[float, float]:
+def _range(mv: Reals) -> tuple[float, float]:
     """What MV is when it is off, and on, all the time; not numbers where MV is beyond."""
     return next(((a, b) for a, b in SPANS if a <= mv.min() and mv.max() <= b), (math.nan, math.nan))
 
@@ -122,7 +122,7 @@ def oscillation_at_rest(pv: Reals, mv: Reals, Ts: float, part: float = OSCILLATE
 
 def _of_this_part(rest: Reals, mv: Reals, near: list[float], trend: Reals, left: float) -> bool:
     """Whether a wave that is on for another part of a window than MV says leaves clearly more of PV at rest."""
-    low, high = _span(mv)
+    low, high = _range(mv)
     mean = float(mv.mean())
     part = (mean - low) / (high - low)
     # on and off changed for each other are the same wave

@@ -37,14 +37,14 @@ LONGEST_RENEWAL = 4
 WHITE = 0.6
 """Smallest ratio of von Neumann of noise around a PV that stands still, without the two largest differences; it is far
 smaller where PV moves."""
-QUIET_MORE, LARGE_MOVE = 15, 0.3
+MORE_SAMPLES, LARGE_MOVE = 15, 0.3
 """A PV that noise does not move has to answer a move of MV, of at least this part of MV's largest so far, within twice
 the rest's duration, which is no shorter than half of T95, and so many samples more."""
 QUANTA_SHOWN = 4.0
 """A move of MV that moves PV by fewer quanta than that may be lost in its rounding."""
 STEADY_CHANGES, STEADY_SPEED, STOPPED_RUNS = 12, 0.4, 6
 """It has stopped in the middle of its way where its last changes, so many, went one way, the last no slower than this
-part of the fastest, and it is then equal for so many times the longest of their runs and QUIET_MORE samples. At a
+part of the fastest, and it is then equal for so many times the longest of their runs and MORE_SAMPLES samples. At a
 turning point it is equal for at most 4.8 times its last run, with a dead band 5.9 times; where noise comes to a coarse
 quantum, for longer, and twice as long is waited for."""
 GRADUAL_CHANGES, GRADUAL_SPEED, SAME_MOVE = 3, 0.5, 1e-6
@@ -75,7 +75,7 @@ class PvWatch:
         """The longest run since the first move of MV that PV has ended."""
         self._jumps = JumpWatch(rest, mv, self._hair, direction, step)
         self._farthest_mv = self._farthest_pv = 0.0
-        self._least_change = self._quantum = math.inf
+        self._smallest_change = self._quantum = math.inf
         """The smallest move of PV within a sample, and of these and their differences, PV units."""
         self._off_home = 0
         """The number of samples for which MV is away from home."""
@@ -123,7 +123,7 @@ class PvWatch:
         if self._rest.lively or self._changes or due is None:
             return
         since = self._n - due
-        if since > RUN_OF_REST * self._rest.samples + QUIET_MORE:
+        if since > RUN_OF_REST * self._rest.samples + MORE_SAMPLES:
             text = f"PV is exactly {self._last:.6g}, as it was before the test, for {since} samples since MV moved"
             raise FalsePv(Reason.PV_FROZEN, f"{text}: the sensor has ended, or MV moves nothing")
 
@@ -140,7 +140,7 @@ class PvWatch:
         """
         if not self._changes or self._farthest_mv == 0.0:
             return True
-        return move * self._farthest_pv > QUANTA_SHOWN * self._least_change * self._farthest_mv
+        return move * self._farthest_pv > QUANTA_SHOWN * self._smallest_change * self._farthest_mv
 
     # equal values
 
@@ -166,7 +166,7 @@ class PvWatch:
         self._run, self._answer_due, self._unanswered = 1, None, None
 
     def _learn_quantum(self, move: float) -> None:
-        self._least_change = min(self._least_change, move)
+        self._smallest_change = min(self._smallest_change, move)
         differs = abs(move - abs(self._changes[-2][0])) if len(self._changes) > 1 else 0.0
         self._quantum = min(self._quantum, move, differs if differs > SAME_MOVE * move else move)
 
@@ -179,7 +179,7 @@ class PvWatch:
             return
         if not self._changes:
             return  # it has not moved since the test began: no sensor that ends, for all that is known
-        longest = max(RUN_OF_REST * rest.samples, RUN_OF_REST * self._longest_run) + QUIET_MORE
+        longest = max(RUN_OF_REST * rest.samples, RUN_OF_REST * self._longest_run) + MORE_SAMPLES
         if self._answer_due is not None and self._n - self._answer_due > longest:
             text = f"though MV moved to {self._moved_mv[0]:.4g} meanwhile; before, it answered"
             raise FalsePv(Reason.PV_FROZEN, f"PV is exactly {pv:.6g} for {run} samples, {text}")
@@ -188,7 +188,7 @@ class PvWatch:
 
     def _check_stop(self, pv: float, mv: float) -> None:
         """A PV that noise does not move, and that stops from one sample to the next."""
-        if self._run <= QUIET_MORE or len(self._changes) < GRADUAL_CHANGES:
+        if self._run <= MORE_SAMPLES or len(self._changes) < GRADUAL_CHANGES:
             return
         sign = math.copysign(1.0, self._changes[-1][0])
         speeds = [sign * move / run for move, run in self._changes]
@@ -201,10 +201,10 @@ class PvWatch:
             if not gradual or last <= QUANTA_SHOWN * self._quantum:
                 return
         longest = max(run for _, run in changes)
-        coarse = last <= QUANTA_SHOWN * self._least_change and len(changes) == STEADY_CHANGES
-        waited = (2 if coarse else 1) * STOPPED_RUNS * longest + QUIET_MORE
+        coarse = last <= QUANTA_SHOWN * self._smallest_change and len(changes) == STEADY_CHANGES
+        waited = (2 if coarse else 1) * STOPPED_RUNS * longest + MORE_SAMPLES
         if self._off_home < self._run + self._longest_run:  # it may have come to rest with MV, and wait for an answer
-            waited = max(waited, RUN_OF_REST * self._longest_run + QUIET_MORE)
+            waited = max(waited, RUN_OF_REST * self._longest_run + MORE_SAMPLES)
         if self._run > waited:
             way = sum(move for move, _ in changes)
             text = f"after it had moved by {way:+.4g} in {sum(run for _, run in changes)}, with MV still at {mv:.4g}"

@@ -9,7 +9,7 @@ import pytest
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, at_rest
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.plan import Mode, Sample, StageStarted
+from loopwright.tuning.plan import Mode, Sample, StageStarted, Work
 from loopwright.tuning.reasons import Reason, Refused
 
 TS, T95, SP = 0.1, 20.0, 50.0
@@ -25,6 +25,9 @@ def listen(
     answer = next(plan)
     while True:
         told += [item.stage if isinstance(item, StageStarted) else type(item).__name__ for item in answer]
+        for item in answer:
+            if isinstance(item, Work):
+                item.run()
         t = n * TS
         n += 1
         try:
