@@ -45,7 +45,7 @@ class InAutomatic:
         if gains is None:
             return ""
         named = f"Kp {gains.Kp:.3g}, Ti {gains.Ti:.3g} s"
-        if (least := self.control.weight_at_least) is not None:
+        if (least := self.control.weight_minimum) is not None:
             named += f", b {least:.2g} or more (OP was at its limit where SP moved)"
         else:
             named += f", b {gains.b:.2g}" if abs(gains.b - 1.0) > SAME_WEIGHT else ""
@@ -100,6 +100,6 @@ def _options(record: Record, control: RecordedControl) -> tuple[str, ...] | None
     if gains is None:
         return ("--kp", "KP", "--ti", "TI")
     options = ["--kp", f"{gains.Kp:.3g}", "--ti", f"{gains.Ti:.3g}"]
-    known = control.weight_at_least is None
+    known = control.weight_minimum is None
     options += ["--b", f"{gains.b:.2g}" if known else "B"] if not known or abs(gains.b - 1.0) > SAME_WEIGHT else []
     return tuple(options)

@@ -220,14 +220,14 @@ class PvWatch:
         sums.append(sums[-1] + x)
         squares.append(squares[-1] + x * x)
         count = len(sums) - 1
-        for window, least in zip(WINDOWS, rest.least_variances, strict=True):
+        for window, smallest in zip(WINDOWS, rest.smallest_variances, strict=True):
             if window > count:
                 break
-            if not least or self._run > (window - 1) * rest.renewal:
+            if not smallest or self._run > (window - 1) * rest.renewal:
                 continue  # equal values are told as such
             total = sums[-1] - sums[-1 - window]
             variance = (squares[-1] - squares[-1 - window] - total * total / window) / (window - 1)
-            if variance < least:
+            if variance < smallest:
                 self._false_noise(pv, window, math.sqrt(max(variance, 0.0)))
         if count >= LOUD_WINDOW and not self._jumps.looking and rest.renewal <= LONGEST_RENEWAL:
             self._check_loud(pv)

@@ -40,10 +40,10 @@ LATER_DELAYS, LATER_HALVES = 2.0, 3.0
 answer, with an inverse response, and so many times the longest half wave."""
 
 
-def has_moved(pv: Sequence[float], noise: float, least: float) -> bool:
+def has_moved(pv: Sequence[float], noise: float, smallest: float) -> bool:
     """Whether PV has moved beyond its noise.
 
-    pv: samples, PV units. noise: its standard deviation. least: the smallest move that counts, PV units. Averages over
+    pv: samples, PV units. noise: its standard deviation. smallest: the smallest move that counts, PV units. Averages
     more and more samples are looked at: of a small, slow answer each sample is within the noise.
     """
     x = np.asarray(pv, dtype=float)
@@ -51,7 +51,7 @@ def has_moved(pv: Sequence[float], noise: float, least: float) -> bool:
     sums = np.concatenate([[0.0], np.cumsum(x - x[0])]) if len(x) else np.zeros(1)
     while 2 * window <= len(x):
         means = (sums[window:] - sums[:-window]) / window
-        if float(np.ptp(means)) > max((MOVED_NOISES + 2.0) * noise / math.sqrt(window), least):
+        if float(np.ptp(means)) > max((MOVED_NOISES + 2.0) * noise / math.sqrt(window), smallest):
             return True
         window *= 2
     return False
@@ -137,12 +137,12 @@ class HalfWaves:
         """Whether PV has gone further in the last quarter of the time than its noise alone makes it seem."""
         quarter = max(away // 4, 1)
         last, before = (sum(part) / quarter for part in (self._away[-quarter:], self._away[-2 * quarter : -quarter]))
-        return last - before > self._least()
+        return last - before > self._smallest()
 
     def _slows_down(self, away: int) -> bool:
         half = away // 2
         first, second = self._away[half] - self._away[0], self._away[-1] - self._away[half]
-        return second < max(SLOWED * first, self._least())
+        return second < max(SLOWED * first, self._smallest())
 
-    def _least(self) -> float:
+    def _smallest(self) -> float:
         return max(2.0 * self._noise, GOES_ON_PART * self._farthest)

@@ -72,10 +72,11 @@ def at_rest(
         # a sticking valve cycles more slowly than what swings PV several times in one look
         if refused.reason is not Reason.NOT_AT_REST or mode is not Mode.AUTOMATIC or isinstance(refused, _Swinging):
             raise
-        cause = yield from worked(partial(find_sticking, facts.sample_time_s, *map(np.asarray, (heard.mv, heard.pv))))
-        if cause is None:
+        rows = map(np.asarray, (heard.mv, heard.pv))
+        sticking = yield from worked(partial(find_sticking, facts.sample_time_s, *rows))
+        if sticking is None:
             raise
-        raise Refused(Reason.NOT_AT_REST, f"{refused.detail}; {cause.in_words}") from None
+        raise Refused(Reason.NOT_AT_REST, f"{refused.detail}; {sticking.in_words}") from None
 
 
 def check_at_rest(

@@ -23,7 +23,7 @@ MIN_REVERSALS, MIN_LEVELS, MAX_RUN_PART = 8, 3, 0.25
 this part of the rest. Of two values alone nothing is known of the noise between them."""
 RUN_OF_REST, RUN_MORE = 2, 10
 """PV is equal for too long after so many times the longest run at rest and so many samples more."""
-RARE, RARE_QUIET = 1e-8, 3e-7
+RARE, RARE_SMALL = 1e-8, 3e-7
 """Probability, by its noise alone, of what a true PV is taken for false for, in one look: of a run of equal values, and
 of a variance that small over one of WINDOWS, which only a PV that stands still can have."""
 LONGEST_BY_CHANCE = 120
@@ -47,12 +47,12 @@ class PvAtRest:
     longest_run: the largest number of samples in a row that were exactly equal.
     renewal: the number of samples from one new value to the next.
     noise: the standard deviation of PV around a mean that stands still, PV units; the larger of that by differences and
-    that over LOUD_WINDOW values.  least_noise: the smaller of both.
+    that over LOUD_WINDOW values.  smallest_noise: the smaller of both.
     loud_variance: the variance beside which PV is too loud: that noise squared, and more as it is less well known.
     quantum: the smallest distance of two values, PV units.
     largest_move: the largest move from one sample to the next, PV units.
     run_limit: the number of equal samples in a row from which PV is false; None where noise does not move PV.
-    least_variances: for each of WINDOWS, the variance below which PV is false; 0 where that is not known.
+    smallest_variances: for each of WINDOWS, the variance below which PV is false; 0 where that is not known.
     """
 
     samples: int
@@ -61,12 +61,12 @@ class PvAtRest:
     longest_run: int
     renewal: int
     noise: float
-    least_noise: float
+    smallest_noise: float
     loud_variance: float
     quantum: float
     largest_move: float
     run_limit: int | None
-    least_variances: tuple[float, ...]
+    smallest_variances: tuple[float, ...]
 
     @classmethod
     def of(cls, pv: Sequence[float]) -> PvAtRest:
@@ -90,7 +90,7 @@ class PvAtRest:
         over = float(np.mean(variances[LOUD_WINDOW])) if LOUD_WINDOW in variances else by_differences
         largest = float(np.abs(np.diff(x)).max())
         limit: int | None = None
-        least = [0.0] * len(WINDOWS)
+        smallest = [0.0] * len(WINDOWS)
         moved = reversals >= MIN_REVERSALS and len(levels) >= MIN_LEVELS and longest <= MAX_RUN_PART * n
         if moved and len(values) >= MIN_RENEWALS:
             chance = _longest_by_chance(quantum, by_differences)
@@ -100,9 +100,9 @@ class PvAtRest:
             if quantum <= COARSE * math.sqrt(small):
                 for at, w in enumerate(WINDOWS):
                     if w in variances:
-                        by_noise = small * float(fdtri(w - 1, len(values) * 2 // 3, RARE_QUIET))
-                        least[at] = min(by_noise, QUIETER_THAN_REST * float(variances[w].min()))
-        noise, least_noise = (math.sqrt(each(by_differences, over)) for each in (max, min))
+                        by_noise = small * float(fdtri(w - 1, len(values) * 2 // 3, RARE_SMALL))
+                        smallest[at] = min(by_noise, QUIETER_THAN_REST * float(variances[w].min()))
+        noise, smallest_noise = (math.sqrt(each(by_differences, over)) for each in (max, min))
         loud = noise**2 * (1.0 + 2.0 / math.sqrt(max(len(values), 1)))
         loud += 0.25 * quantum**2 if quantum > 0.5 * noise else 0.0  # in the middle between two values PV is louder
         return cls(
@@ -112,12 +112,12 @@ class PvAtRest:
             longest_run=longest,
             renewal=renewal,
             noise=noise,
-            least_noise=least_noise,
+            smallest_noise=smallest_noise,
             loud_variance=loud,
             quantum=quantum,
             largest_move=largest,
             run_limit=limit,
-            least_variances=tuple(least),
+            smallest_variances=tuple(smallest),
         )
 
     @property

@@ -135,9 +135,9 @@ class JumpWatch:
         largest = max(self._largest, self._largest_of_mv * self._farthest_mv)
         if self._claim is not None:
             largest = max(largest, self._claim.size)
-        least = max(JUMP_NOISES * rest.noise, JUMP_MOVES * largest, self._step if renewal is None else 0.0)
+        smallest = max(JUMP_NOISES * rest.noise, JUMP_MOVES * largest, self._step if renewal is None else 0.0)
         since = self._unanswered_since
-        if abs(move) > least > 0.0 and (since is None or rest.renewal == 1):
+        if abs(move) > smallest > 0.0 and (since is None or rest.renewal == 1):
             side = math.copysign(1.0, mv - self._mv_home)
             by_mv = since is not None and move * self._direction * side > 0.0
             delay = self._n - since if since is not None and by_mv else None

@@ -111,8 +111,8 @@ def what_moved(t_s: Array, mv: Array, pv: Array, T95_s: float, noise: float) -> 
         _refined(u, y, h, min((each[i] for each in coarse), key=_left), (delays[1], times[1]))[i]
         for i in range(3)
     )
-    least = max(of_mean, (NEGLIGIBLE_OF_ONE_MOVE if one_move else NEGLIGIBLE) * abs(moved))
-    of_mv, of_both, of_neither = (max(each.left, len(y) * least**2) for each in (mv_alone, both, neither))
+    smallest = max(of_mean, (NEGLIGIBLE_OF_ONE_MOVE if one_move else NEGLIGIBLE) * abs(moved))
+    of_mv, of_both, of_neither = (max(each.left, len(y) * smallest**2) for each in (mv_alone, both, neither))
     beside = abs(both.size) * ((len(y) - both.at) * h if both.drifts else 1.0) > MATERIAL * abs(moved)
     # one move of MV and one disturbance at that time look alike: what MV explains as well is its answer
     hidden = of_neither < CLEAR * of_both and abs(both.answer) < MATERIAL * abs(moved)

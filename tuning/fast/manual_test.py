@@ -44,7 +44,7 @@ BACK_T95, BACK_PULSES = 2.0, 6.0
 RAISE, MAX_RAISES = 4.0, 3
 """Factor by which a pulse is raised that PV has hardly answered, and how often. One that has not moved PV beyond its
 noise is not raised: a sensor that has ended, or a valve that does not move, is not told from it."""
-LEAST_STEPS = 1e-3
+MIN_STEPS = 1e-3
 """Smallest move of a PV without noise, in permitted steps."""
 SAMPLES_TO_FOLLOW = 30
 """Number of samples after which MV has to have followed the manual output, or to be on its way."""
@@ -108,7 +108,7 @@ class ManualTest(Experiment):
             is_largest = raised == MAX_RAISES or self.size >= self.largest
             if self._farthest >= (TURN_NOISES * self.noise if is_largest else self._turns_at):
                 return (yield from self._until_back(width))
-            moved = has_moved(self.trace.pv[self._begun :], self.noise, LEAST_STEPS * self.facts.sp_deviation)
+            moved = has_moved(self.trace.pv[self._begun :], self.noise, MIN_STEPS * self.facts.sp_deviation)
             if not is_largest and moved:
                 size = min(RAISE * self.size, self.largest)
                 yield from self.report(

@@ -194,9 +194,9 @@ class ScoreTests:
 
     def _by_rounding(self, deviation: float) -> float:
         """How large an alternative of this standard deviation rounding errors alone can make, where they go with PV."""
-        samples_worth = math.sqrt(len(self._unexplained) / self._variance) if self._variance > 0.0 else 0.0
+        per_variance = math.sqrt(len(self._unexplained) / self._variance) if self._variance > 0.0 else 0.0
         return (
-            ROUNDING_ALIKE * self._rounding_of_variance * samples_worth * deviation if math.isfinite(deviation) else 0.0
+            ROUNDING_ALIKE * self._rounding_of_variance * per_variance * deviation if math.isfinite(deviation) else 0.0
         )
 
     def _regression(self, column: Reals) -> tuple[float, float]:

@@ -103,8 +103,8 @@ def find_valve_fault(fit: Fit[ExperimentRecord], best: Fitted) -> ValveFault | N
     # better start, as the best fit may be a local minimum. The perfect valve is therefore fitted with both.
     sound = fit.search(structure, slack, [start, found.theta], FIRST_STEPS + STEPS)
     gain = min(best.bic, sound.bic) - found.bic
-    least = MIN_BIC_GAIN_OF_SMALL if fault is stiction and size < SMALL_STICTION else MIN_BIC_GAIN
-    return ValveFault(FAULTS[fault][1].format(size * record.input_range), gain) if gain > least else None
+    minimum = MIN_BIC_GAIN_OF_SMALL if fault is stiction and size < SMALL_STICTION else MIN_BIC_GAIN
+    return ValveFault(FAULTS[fault][1].format(size * record.input_range), gain) if gain > minimum else None
 
 
 def _with_fault(record: ExperimentRecord, fault: Fault, size: float) -> ExperimentRecord:

@@ -64,7 +64,7 @@ class RecordedControl:
     gains: the gains that MV follows by, ISA form, Kp positive; None: not found, or there is a derivative, whose filter
     would have to be known.
     part: the part of the variance of MV's moves that they explain; 0 without them.
-    weight_at_least: the least that the set-point weight is, where MV was at a limit whenever the set-point moved, so
+    weight_minimum: the least that the set-point weight is, where MV was at a limit whenever the set-point moved, so
     that the record does not tell it; the gains have then the larger one of this and 1.
     """
 
@@ -72,7 +72,7 @@ class RecordedControl:
     setpoint_moves: int | None
     gains: Gains | None
     part: float
-    weight_at_least: float | None = None
+    weight_minimum: float | None = None
 
 
 def recorded_control(Ts: float, mv: Reals, pv: Reals, sp: Reals | None) -> RecordedControl | None:
@@ -93,7 +93,7 @@ def recorded_control(Ts: float, mv: Reals, pv: Reals, sp: Reals | None) -> Recor
         certain = by_an_operator or law.gains is not None or _follows(mv, pv, sp)
     if not certain and len(np.unique(mv)) < MANY_VALUES:
         return None
-    return RecordedControl(certain, moves, law.gains, law.part, law.weight_at_least)
+    return RecordedControl(certain, moves, law.gains, law.part, law.weight_minimum)
 
 
 def at_limit(mv: Reals) -> Bools:
@@ -169,11 +169,11 @@ def _climbs_as_controlled(mv: Reals, pv: Reals, sp: Reals | None) -> bool:
 
 
 class _FoundLaw(NamedTuple):
-    """The gains that MV's moves follow by, the part of their variance that these explain, and `weight_at_least`."""
+    """The gains that MV's moves follow by, the part of their variance that these explain, and `weight_minimum`."""
 
     gains: Gains | None
     part: float = 0.0
-    weight_at_least: float | None = None
+    weight_minimum: float | None = None
 
 
 def _gains(Ts: float, mv: Reals, pv: Reals, sp: Reals | None) -> _FoundLaw:
@@ -195,17 +195,17 @@ def _gains(Ts: float, mv: Reals, pv: Reals, sp: Reals | None) -> _FoundLaw:
     Kp, Ki = float(found[0]), float(found[1])
     if part < MIN_PART or derivative or Kp * Ki <= 0.0:
         return _FoundLaw(None)
-    at_least = None
+    minimum = None
     if moved:
         b = float(found[2] / Kp)
     elif np.any(stepped):
         steps = np.flatnonzero(stepped)
         asked = moves[steps] - np.column_stack(columns)[steps] @ found
-        at_least = max(float(np.max(asked / (Kp * stepped[steps]))), 0.0)
-        b = max(1.0, at_least)
+        minimum = max(float(np.max(asked / (Kp * stepped[steps]))), 0.0)
+        b = max(1.0, minimum)
     else:
         b = 1.0
-    return _FoundLaw(Gains(abs(Kp), Kp / Ki, b=0.0 if abs(b) < NO_WEIGHT else b), part, at_least)
+    return _FoundLaw(Gains(abs(Kp), Kp / Ki, b=0.0 if abs(b) < NO_WEIGHT else b), part, minimum)
 
 
 def _law(columns: list[Reals], moves: Reals) -> tuple[Reals, float]:

@@ -378,8 +378,8 @@ def test_op_at_its_limit_bounds_the_set_point_weight(b: float, high: float, chan
         pytest.approx(60.0, rel=0.03),
     )
     least = (high - 50.0) / (6.0 * change)
-    assert found.control.weight_at_least == pytest.approx(least, rel=0.01) and least < b
-    assert f"b {found.control.weight_at_least:.2g} or more (OP was at its limit where SP moved)" in found.law
+    assert found.control.weight_minimum == pytest.approx(least, rel=0.01) and least < b
+    assert f"b {found.control.weight_minimum:.2g} or more (OP was at its limit where SP moved)" in found.law
     assert found.options[-2:] == ("--b", "B")
     assert record.sp is not None
     for weight, accepted in ((b, True), (1.0, True), (0.5 * least, False)):
@@ -393,7 +393,7 @@ def test_op_at_its_limit_bounds_the_set_point_weight(b: float, high: float, chan
 
 def test_one_set_point_step_within_the_limits_fixes_the_weight() -> None:
     found = in_automatic(level_loop(0.7, 100.0, [(100, 15.0), (400, 12.0)]))
-    assert found is not None and found.control.weight_at_least is None and found.control.gains is not None
+    assert found is not None and found.control.weight_minimum is None and found.control.gains is not None
     assert found.control.gains.b == pytest.approx(0.7, rel=0.01)
 
 

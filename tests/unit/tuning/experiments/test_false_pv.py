@@ -138,6 +138,6 @@ def test_what_is_learned_of_a_rest() -> None:
     assert (rest.renewal, rest.samples) == (4, REST)
     assert rest.quantum == pytest.approx(0.5 * NOISE)
     assert 4 <= rest.longest_run <= 16
-    assert 0.5 * NOISE < rest.least_noise <= rest.noise < 2.0 * NOISE
+    assert 0.5 * NOISE < rest.smallest_noise <= rest.noise < 2.0 * NOISE
     nothing = PvAtRest.of([])
     assert nothing.samples == 0 and math.isnan(nothing.value) and not nothing.lively
