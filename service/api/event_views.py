@@ -138,7 +138,7 @@ class JobEventView(RootModel[Annotated[Stored | ProgressEvent, Field(discriminat
     """An event of a job, as the stream has it."""
 
 
-STREAMED_EVENT: Schema = {
+STREAMED_EVENT: dict[str, object] = {
     "type": "object",
     "properties": {
         "id": {"type": "string"},
