@@ -239,11 +239,13 @@ def held(facts: Facts, point: OperatingPoint, trace: Trace, text: str, otherwise
     """
     found = what_moved_pv(facts, point, trace)
     reason = otherwise
-    if found.load:
+    # a plant that integrates or runs away looks like one that a load or a drift moves: the words name that
+    looks_alike = found.answered and otherwise is Reason.NOT_SELF_REGULATING
+    if found.load and not looks_alike:
         reason = Reason.STALLED
     elif not found.answered:
         reason = Reason.NO_RESPONSE
-    elif found.drift:
+    elif found.drift and not looks_alike:
         reason = Reason.DISTURBED
     elif (found.gain > 0.0) != facts.reverse:
         reason, text = Reason.WRONG_SIGN, f"PV went the wrong way: {text}"

@@ -317,11 +317,6 @@ def _baseline(facts: Facts, point: OperatingPoint, trace: Trace) -> Plan[StepRes
     result = yield from step_test(
         facts, point, step, band=0.05, max_s=5 * facts.T95_s, smooth_s=facts.T95_s / 12, into=trace
     )
-    if not result.settled:
-        text = f"PV has not settled within {result.duration_s:.3g} s of a set-point step of {step:.4g}"
-        found = held(facts, point, trace, text, Reason.NOT_SELF_REGULATING)
-        if found.reason is not Reason.NOT_SELF_REGULATING:
-            raise found
     if abs(result.static_gain) * facts.old_gains.Kp > MAX_GAIN:
         raise Refused(
             Reason.NOT_SELF_REGULATING,
@@ -334,6 +329,11 @@ def _baseline(facts: Facts, point: OperatingPoint, trace: Trace) -> Plan[StepRes
             f"PV over MV gave a gain of {result.static_gain:.4g} with a "
             f"{'reverse' if facts.reverse else 'direct'}-acting controller",
         )
+    if not result.settled:
+        text = f"PV has not settled within {result.duration_s:.3g} s of a set-point step of {step:.4g}"
+        found = held(facts, point, trace, text, Reason.NOT_SELF_REGULATING)
+        if found.reason is not Reason.NOT_SELF_REGULATING:
+            raise found
     return result
 
 
