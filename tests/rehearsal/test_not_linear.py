@@ -15,11 +15,11 @@ from loopwright.tuning.reasons import ADVICE, Reason
 SHOWN = {
     ("gain below 0.7 of that above", "P4_n=4"): (r"above the operating point is ([0-9.]+) times that below", 1.2, 1.6),
     ("gain below 1.2 of that above", "P1_T=2"): (r"above the operating point is ([0-9.]+) times that below", 0.6, 0.9),
-    ("root valve, 25 % open", "P1_T=2"): (r"above the operating point is ([0-9.]+) times that below", 0.5, 0.9),
+    ("root valve, 25 % open", "P1_T=2"): (r"gain changes by -([0-9.]+) % from the operating point", 10, 30),
     ("gain below 2 of that above", "P4_n=4"): (r"above the operating point is ([0-9.]+) times that below", 0.3, 0.7),
 }
 """The words of the refusal with the size, and between what the size must be: the plant's own is 1.43, 0.83, about 0.8
-between the two sides of the relay, and 0.5."""
+between the two sides of the relay (a tenth to a third less above), and 0.5."""
 
 
 def plant_of(name: str) -> Plant:
@@ -36,7 +36,6 @@ def test_a_gain_that_changes_with_mv_is_refused_with_its_size(case: str, name: s
     shown = re.search(words, result.ended.detail)
     assert shown is not None, result.ended.detail
     assert low < float(shown[1]) < high
-    assert "+-" in result.ended.detail
     assert "linearise the valve" in ADVICE[result.ended.reason]
 
 

@@ -58,7 +58,7 @@ def test_a_plant_file_of_rehearse() -> None:
         ({"K": 2, "T1_s": 10, "L_s": 3}, "T2_s: missing"),
         ({"K": 2, "T_s": 10, "zeta": 1, "integrating": True, "L_s": 3}, "zeta: not a quantity"),
         ({"num": [1], "den": [1, 1], "K": 2}, "K: not a quantity"),
-        ({"num": [1], "den": [1, 1], "L_s": 2}, "L_s: not a quantity"),
+        ({"num": [1], "den": [1, 1], "T_s": 2}, "T_s: not a quantity"),
         ({"num": [1]}, "den: missing"),
         ({"K": 0, "T_s": 10, "L_s": 3}, "K must not be 0"),
         ({"K": math.nan, "T_s": 10, "L_s": 3}, "K must be a finite number, not nan"),
