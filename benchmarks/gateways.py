@@ -10,7 +10,6 @@ do, which shows what gateways add, and once without, which shows what the proces
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
 import threading
 import time
@@ -128,10 +127,6 @@ def fleet(folder: Path, gateways: int, server: Server, pace: float, at_once: int
         wall, after = time.perf_counter() - began, used()
         asked = statements(engine) - asked_before
         watch.close()
-        if "--verbose" in sys.argv:
-            for query, calls in asked.most_common(70):
-                print(f"{calls / count:7.2f} {' '.join(query.split())[:230]}", file=sys.stderr)
-            print(watch.looks, watch.idle, file=sys.stderr)
         if set(states) != {"proposed"}:
             raise RuntimeError(f"the jobs ended as {states}")
         return {

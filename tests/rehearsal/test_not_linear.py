@@ -36,6 +36,7 @@ def test_a_gain_that_changes_with_mv_is_refused_with_its_size(case: str, name: s
     shown = re.search(words, result.ended.detail)
     assert shown is not None, result.ended.detail
     assert low < float(shown[1]) < high
+    assert ("+-" in result.ended.detail) == (case != "root valve, 25 % open"), result.ended.detail
     assert "linearise the valve" in ADVICE[result.ended.reason]
 
 
