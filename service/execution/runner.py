@@ -210,19 +210,22 @@ class _Run(Generic[T]):
             self._guard.check_end()
         except FalsePv as false:
             self._result.ended = FalsePv(false.reason, f"{false.detail} (without that: {ended})")
+        except Exception as defect:  # the loop is restored all the same
+            self._on_event(Note(f"whether PV is false was not found out, by a defect: {defect!r}"))
 
     def _look_on(self, guard: Guard) -> None:
         """Looks at a few more samples with MV as it was before the test, where PV has just jumped: whether it stays.
         Raises FalsePv."""
         commands: list[Command] = [SetMode(Mode.MANUAL), SetOutput(self._home.mv)] if self._home is not None else []
-        looks = guard.undecided
-        while looks:
+        looks, until = guard.undecided, self._now + self._limits.max_frozen_s  # longer than any dead time
+        while looks and self._now <= until:
             try:
                 sample = self._loop.step(commands)
             except Ended as ended:
                 self._on_event(Note(f"PV could not be looked at any longer: {ended}"))
                 return
             self._samples.append(sample)
+            self._now = sample.t
             commands, looks = [], guard.look_on(sample)
 
     def _hold(self) -> None:

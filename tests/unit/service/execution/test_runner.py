@@ -13,7 +13,7 @@ import pytest
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.service.execution.guard import RunLimits
+from loopwright.service.execution.guard import Guard, RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.loops.loop import Restored
@@ -323,6 +323,19 @@ def test_a_pv_that_jumps_beyond_its_limits_is_looked_at_until_it_is_known_to_sta
     result = run(trial(), loop, limits=RunLimits(pv_low=-4.0, pv_high=4.0))
     assert (type(result.ended), result.ended and result.ended.reason.value) == (kind, reason)
     assert loop.read().mode is (Mode.MANUAL if kind is FalsePv else Mode.AUTOMATIC)
+
+
+def test_a_defect_in_the_doubt_of_pv_keeps_no_loop_from_being_restored(monkeypatch: pytest.MonkeyPatch) -> None:
+    def defective(_guard: Guard) -> None:
+        raise ZeroDivisionError
+
+    def plan() -> Plan[None]:
+        yield ()
+        raise Refused(Reason.NO_RESPONSE, "PV did not move")
+
+    monkeypatch.setattr(Guard, "check_end", defective)
+    result = run(plan(), Meddled(), limits=RunLimits())
+    assert result.ended is not None and result.ended.reason is Reason.NO_RESPONSE and result.restored is not None
 
 
 def test_a_refusal_on_a_pv_that_never_answered_leaves_the_loop_held() -> None:
