@@ -53,5 +53,5 @@ def job(result: FastResult) -> Job:
     return Job(
         number=1, id="j2", loop="A", state=JobState.ACCEPTED, dry_run=False, request={}, requested_by="me",
         created_at="2026-02-01", plant_time_s=1.0, result=result, host="local", version="0", attempt=1, session=1,
-        look_after=False, stop_reason=None, **none,
+        look_after=False, stop_reason=None, false_pv=None, **none,
     )  # fmt: skip
