@@ -14,6 +14,9 @@ AVERAGED = 3
 """Number of samples whose mean tells where PV is."""
 BAND_NOISES = 5.0
 """The band around rest, in noises, where the relay's hysteresis is narrower."""
+BAND_STEPS = 0.02
+"""The narrowest band around rest, in permitted set-point steps: a PV without noise creeps on one side of its rest as long
+as the dead time lasts."""
 MOVED_NOISES = 5.0
 """The range of PV's averages, in their noises, above which PV has moved."""
 TURNED_NOISES, TURNED_PART = 4.0, 0.1
@@ -66,7 +69,7 @@ class HalfWaves:
 
     def __init__(self, facts: Facts, point: OperatingPoint, noise: float, hysteresis: float) -> None:
         self._facts, self._rest, self._noise = facts, point.pv, noise
-        self._band = max(hysteresis, BAND_NOISES * noise / math.sqrt(AVERAGED))
+        self._band = max(hysteresis, BAND_NOISES * noise / math.sqrt(AVERAGED), BAND_STEPS * facts.sp_deviation)
         self._last: list[float] = []
         self._samples = 0
         self._delay = 0

@@ -16,10 +16,10 @@ TS, NOISE, T95 = 0.5, 0.05, 100.0
 POINT = OperatingPoint(60.0, 60.0, 40.0, NOISE, 30.0)
 
 
-def ended_after(pv: np.ndarray, T95_s: float = T95, up: bool = True) -> int | None:
+def ended_after(pv: np.ndarray, T95_s: float = T95, up: bool = True, noise: float = NOISE) -> int | None:
     """The number of samples after which the first half wave has ended."""
     facts = Facts(TS, T95_s, 0.0, 100.0, 2.0, Gains(1.0, 30.0))
-    waves = HalfWaves(facts, POINT, NOISE, 2.2 * NOISE)
+    waves = HalfWaves(facts, POINT, noise, 2.2 * noise)
     for n, value in enumerate(pv):
         if waves.goes_wrong(float(value), up):
             assert waves.wrong_sign().reason is Reason.WRONG_SIGN
@@ -52,6 +52,14 @@ def test_an_inverse_response_is_waited_for(slow: float, T: float, L: float, seed
     moved = 1.0 - np.exp(-since) * (1.0 + since + slow * since)
     pv = 60.0 + 12.0 * moved + NOISE * np.random.default_rng(seed).standard_normal(len(t))
     assert ended_after(pv, 5.0 * T + L) is None
+
+
+def test_a_creep_of_a_pv_without_noise_is_no_way_that_it_goes() -> None:
+    """During a dead time of 0.3 T95, which an inverse response of 0.17 T95 follows."""
+    creep = 60.0 - 1e-6 * np.arange(round(0.3 * T95 / TS))
+    t = np.arange(0.0, 0.17 * T95, TS)
+    inverse = 60.0 - np.sin(np.pi * t / t[-1])
+    assert ended_after(np.concatenate([creep, inverse, 60.0 + t / t[-1]]), noise=0.0) is None
 
 
 def test_noise_is_no_move_and_a_slow_answer_within_it_is() -> None:
