@@ -15,8 +15,8 @@ AVERAGED = 3
 BAND_NOISES = 5.0
 """The band around rest, in noises, where the relay's hysteresis is narrower."""
 BAND_STEPS = 0.02
-"""The narrowest band around rest, in permitted set-point steps: a PV without noise creeps on one side of its rest as long
-as the dead time lasts."""
+"""The narrowest band around rest, in permitted set-point steps: PV without noise creeps on one side of its rest during
+a dead time."""
 MOVED_NOISES = 5.0
 """The range of PV's averages, in their noises, above which PV has moved."""
 TURNED_NOISES, TURNED_PART = 4.0, 0.1

@@ -108,8 +108,7 @@ def what_moved(t_s: Array, mv: Array, pv: Array, T95_s: float, noise: float) -> 
     times = np.linspace(0, last, TIMES)
     coarse = [_explanations(u, y, h, [T], delays, times) for T in lags]
     mv_alone, both, neither = (
-        _refined(u, y, h, min((each[i] for each in coarse), key=_left), (delays[1], times[1]))[i]
-        for i in range(3)
+        _refined(u, y, h, min((each[i] for each in coarse), key=_left), (delays[1], times[1]))[i] for i in range(3)
     )
     smallest = max(of_mean, (NEGLIGIBLE_OF_ONE_MOVE if one_move else NEGLIGIBLE) * abs(moved))
     of_mv, of_both, of_neither = (max(each.left, len(y) * smallest**2) for each in (mv_alone, both, neither))
