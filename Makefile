@@ -21,12 +21,16 @@ setup: $(VENV)/.installed
 
 # Pinned in constraints.txt: the same versions tomorrow as today.
 $(VENV)/.installed: pyproject.toml constraints.txt
-	@sh tools/make-venv $(PYTHON) $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
-	touch $@
+	@sh tools/make-venv $(PYTHON) $(VENV) dev
+	@touch $(VENV)/.demo $@
+
+# The demo needs no linters and no documents.
+$(VENV)/.demo: pyproject.toml constraints.txt
+	@sh tools/make-venv $(PYTHON) $(VENV) service,plot
+	@touch $@
 
 # DEMO="--method fast" shows one method alone.
-demo: setup
+demo: $(VENV)/.demo
 	$(BIN)/loopwright demo $(DEMO)
 
 # Installs the Debian packages that the tests need. Without root or apt-get it prints the line to type.

@@ -198,30 +198,35 @@ VENV = str(ROOT / "tools/make-venv")
 
 
 def test_without_python_it_is_said_what_to_install(system: StandIns, tmp_path: Path) -> None:
-    found = system.run(VENV, "python3", str(tmp_path / "venv"))
+    found = system.run(VENV, "python3", str(tmp_path / "venv"), "dev")
     assert found.returncode == 1 and "there is no python3 here" in found.stderr
     assert "apt-get install python3 python3-venv" in found.stderr
 
 
 def test_of_an_old_python_too(system: StandIns, tmp_path: Path) -> None:
     system.add("python3", 'case "$1" in --version) echo Python 3.9.2;; *) exit 1;; esac')
-    found = system.run(VENV, "python3", str(tmp_path / "venv"))
+    found = system.run(VENV, "python3", str(tmp_path / "venv"), "dev")
     assert found.returncode == 1 and "Python 3.11 or newer, with venv: python3 is Python 3.9.2" in found.stderr
 
 
-def test_a_python_without_venv_is_asked_again_the_next_time(system: StandIns, tmp_path: Path) -> None:
-    """Debian's leaves an environment without pip behind, which looks as if it were one."""
-    folder = tmp_path / "venv"
-    half = f"mkdir -p {folder}/bin; echo 'exit 1' >{folder}/bin/python; echo ensurepip is not available >&2; exit 1"
-    system.add("python3", f'case "$1" in -m) {half};; esac')
-    for _ in range(2):
-        found = system.run(VENV, "python3", str(folder))
-        assert found.returncode == 1 and "ensurepip is not available" in found.stderr
-        assert "python3-venv" in found.stderr
+def test_of_a_python_without_venv(system: StandIns, tmp_path: Path) -> None:
+    system.add("python3", 'case "$2" in *ensurepip*) exit 1;; esac')
+    found = system.run(VENV, "python3", str(tmp_path / "venv"), "dev")
+    assert found.returncode == 1 and "python3 has no venv or no ensurepip" in found.stderr
+    assert "python3-venv" in found.stderr
 
 
-def test_one_that_is_there_is_left_alone(system: StandIns, tmp_path: Path) -> None:
-    (tmp_path / "venv/bin").mkdir(parents=True)
-    (tmp_path / "venv/bin/python").symlink_to(sys.executable)
-    system.add("python3", 'case "$1" in -c) exit 0;; *) exit 1;; esac')
-    assert system.run(VENV, "python3", str(tmp_path / "venv")).returncode == 0
+@pytest.mark.parametrize("there", [True, False])
+def test_an_environment_whose_python_works_is_kept(system: StandIns, tmp_path: Path, there: bool) -> None:
+    program, log = tmp_path / "venv/bin/python", tmp_path / "log"
+    python = f'#!/bin/sh\necho "$0 $@" >>{log}'
+    make = f"mkdir -p {program.parent}; echo '{python}' >{program}; chmod +x {program}"
+    system.add("python3", f'case "$1" in -m) {make};; esac')
+    (system.folder / "chmod").symlink_to(shutil.which("chmod") or "")
+    if there:
+        program.parent.mkdir(parents=True)
+        program.write_text(f"{python}\n# mine\n")
+        program.chmod(0o755)
+    assert system.run(VENV, "python3", str(tmp_path / "venv"), "dev").returncode == 0
+    assert ("# mine" in program.read_text()) is there
+    assert log.read_text().splitlines()[-1] == f"{program} {ROOT}/tools/install_packages.py dev"
