@@ -11,7 +11,7 @@ import numpy as np
 from loopwright.tuning.analysis.pv_faults import without_wrong_samples
 from loopwright.tuning.experiments.control_record import ControlRecord, control_record
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
-from loopwright.tuning.fast.record import ExperimentRecord, noise_of
+from loopwright.tuning.fast.record import Excitation, ExperimentRecord, noise_of
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Reals
 from loopwright.tuning.plan import Command, Event, Plan, Sample, SetSetpoint, Work
@@ -78,6 +78,26 @@ class Experiment:
     def experiment_record(self) -> ExperimentRecord:
         """The record so far, as deviations from rest."""
         raise NotImplementedError
+
+    def _record(
+        self, turns: int, period: float, excitation: Excitation, control: ControlRecord | None = None
+    ) -> ExperimentRecord:
+        """The record so far. turns, period, excitation, control: see `ExperimentRecord`. Raises Refused as it does."""
+        u, y = self._deviations()
+        return ExperimentRecord(
+            Ts=self.facts.sample_time_s,
+            u=u,
+            y=y,
+            direction=self._direction,
+            listened=self.listened,
+            excited=self.excited if self._stepping else len(self.trace),
+            turns=turns,
+            period=period,
+            steps=tuple(self._steps),
+            excitation=excitation,
+            one_sided=self.facts.one_sided and excitation is not Excitation.RELAY,
+            control=control,
+        )
 
     def _deviations(self) -> tuple[Reals, Reals]:
         """MV and PV of the record as deviations from their means at rest. Single wrong samples of PV are interpolated,

@@ -15,15 +15,13 @@ import numpy as np
 
 from loopwright.tuning.experiments.half_wave import has_moved
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, held
-from loopwright.tuning.fast.experiment import Experiment
 from loopwright.tuning.fast.manual_sizes import ManualRecord, first_pulse, largest_pulse, next_pulse, pv_bounds
-from loopwright.tuning.fast.proposal import PulseFigures
 from loopwright.tuning.fast.pulse_levels import PulseBounds
-from loopwright.tuning.fast.pulse_test import MAX_BEYOND, SAMPLES_AVERAGED
+from loopwright.tuning.fast.pulse_test import MAX_BEYOND, SAMPLES_AVERAGED, PulseExperiment
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.record_evaluation import MIN_PERIOD
 from loopwright.tuning.fast.self_regulation import comes_to_rest
-from loopwright.tuning.models import Model, Reals
+from loopwright.tuning.models import Model
 from loopwright.tuning.plan import Command, Note, Plan, Sample, SetOutput, SetPvLimits
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -52,7 +50,7 @@ HAIR = 1e-4
 """Distance from the manual output at which MV has followed, as a fraction of MV's range."""
 
 
-class ManualTest(Experiment):
+class ManualTest(PulseExperiment):
     """The pulses of the manual output.
 
     facts, point: what is known of the loop, and the operating point at rest.
@@ -70,9 +68,6 @@ class ManualTest(Experiment):
         if not self.largest > 0.0:
             raise Refused(Reason.SATURATED, f"MV {self.home:.4g} leaves no room for a pulse")
         self.size = first_pulse(facts.old_gains.Kp * facts.sp_deviation, self.largest)
-        self.turns: list[int] = []  # samples at which MV left home, or came back
-        self.period = 0.0
-        """The time scale of the record, in samples; known after the first pulse."""
         self._begun = len(self.trace)
         """The sample at which the first pulse, or its larger repetition, began."""
         self._farthest = 0.0
@@ -173,39 +168,10 @@ class ManualTest(Experiment):
 
     def experiment_record(self) -> ExperimentRecord:
         """The record so far, as deviations from rest; `period` must be known. Raises Refused as `ExperimentRecord`."""
-        return self._record(self.period)
+        return self._manual_record(self.period)
 
-    def _record(self, period: float) -> ExperimentRecord:
-        u, y = self._deviations()
-        return ExperimentRecord(
-            Ts=self.facts.sample_time_s,
-            u=u,
-            y=y,
-            direction=self._direction,
-            listened=self.listened,
-            excited=len(self.trace),
-            turns=len(self.turns) - 1,
-            period=period,
-            excitation=Excitation.MANUAL,
-            one_sided=self.facts.one_sided,
-        )
-
-    def figures(self) -> PulseFigures:
-        """The figures of the pulses so far."""
-        record = self.experiment_record()
-        return PulseFigures(
-            turns=record.turns,
-            size=self.size,
-            period_s=record.period * record.Ts,
-            output_range=record.output_range,
-            noise=self.noise,
-            samples=len(record.y),
-        )
-
-    def columns(self) -> tuple[Reals, Reals]:
-        """MV and PV since the first pulse, as deviations from rest."""
-        u, y = self._deviations()
-        return u[self.listened :], y[self.listened :]
+    def _manual_record(self, period: float) -> ExperimentRecord:
+        return self._record(len(self.turns) - 1, period, Excitation.MANUAL)
 
     def _until_back(self, width: int) -> Plan[None]:
         """Waits until PV has come back by half from its farthest point of this pulse. Raises Refused
@@ -219,7 +185,7 @@ class ManualTest(Experiment):
             if farthest - away >= max(CAME_BACK * farthest, MIN_BACK_NOISES * self.noise):
                 return
             if len(self.trace) - back > longest:
-                if (yield from self.computed(partial(comes_to_rest, self._record(MIN_PERIOD)))):
+                if (yield from self.computed(partial(comes_to_rest, self._manual_record(MIN_PERIOD)))):
                     text = "PV has not come back, but a load disturbance explains that"
                     return (yield from self.report(Note(text)))
                 passed = (len(self.trace) - back) * facts.sample_time_s

@@ -59,7 +59,38 @@ HAIR = 1e-6
 """Distance from a limit at which MV is at it, as a fraction of MV's range: a REAL32 on the bus."""
 
 
-class PulseTest(Experiment):
+class PulseExperiment(Experiment):
+    """What pulses of the set-point and of the manual output share; arguments as of `Experiment`."""
+
+    size: float
+    """Of a pulse, in units of what is moved."""
+
+    def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace) -> None:
+        super().__init__(facts, point, listened)
+        self.turns: list[int] = []
+        """The samples at which the set-point, or MV, moved; the first one is the start."""
+        self.period = 0.0
+        """The time scale of the record, in samples; known after the first pulse."""
+
+    def figures(self) -> PulseFigures:
+        """The figures of the pulses so far."""
+        record = self.experiment_record()
+        return PulseFigures(
+            turns=record.turns,
+            size=self.size,
+            period_s=record.period * record.Ts,
+            output_range=record.output_range,
+            noise=self.noise,
+            samples=len(record.y),
+        )
+
+    def columns(self) -> tuple[Reals, Reals]:
+        """MV and PV since the first pulse, as deviations from rest."""
+        u, y = self._deviations()
+        return u[self.listened :], y[self.listened :]
+
+
+class PulseTest(PulseExperiment):
     """The pulses of the set-point, and the set-point step home that follows them.
 
     facts, point: what is known of the loop, and the operating point at rest.
@@ -69,12 +100,9 @@ class PulseTest(Experiment):
     def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace) -> None:
         super().__init__(facts, point, listened)
         self.size = pulse_size(facts.sp_deviation, point.room, facts.old_gains, facts.one_sided)
-        self.turns: list[int] = []  # samples at which the set-point moved; the first one is the start
         self.levels: list[float] = []  # of the set-point, in sizes of a pulse
         self._gains = facts.old_gains
         self._at_limit = 0
-        self.period = 0.0
-        """The time scale of the record, in samples, from `first_period`."""
 
     def start(self) -> Plan[None]:
         """Makes the first move of the set-point."""
@@ -196,38 +224,7 @@ class PulseTest(Experiment):
 
     def experiment_record(self) -> ExperimentRecord:
         """The record so far, as deviations from rest; `period` must be known. Raises Refused as `ExperimentRecord`."""
-        u, y = self._deviations()
-        return ExperimentRecord(
-            Ts=self.facts.sample_time_s,
-            u=u,
-            y=y,
-            direction=self._direction,
-            listened=self.listened,
-            excited=self.excited if self._stepping else len(self.trace),
-            turns=len(self.turns) - 1,
-            period=self.period,
-            steps=tuple(self._steps),
-            excitation=Excitation.SETPOINT,
-            one_sided=self.facts.one_sided,
-            control=self._control(),
-        )
-
-    def figures(self) -> PulseFigures:
-        """The figures of the pulses so far."""
-        record = self.experiment_record()
-        return PulseFigures(
-            turns=record.turns,
-            size=self.size,
-            period_s=record.period * record.Ts,
-            output_range=record.output_range,
-            noise=self.noise,
-            samples=len(record.y),
-        )
-
-    def columns(self) -> tuple[Reals, Reals]:
-        """MV and PV since the first pulse, as deviations from rest."""
-        u, y = self._deviations()
-        return u[self.listened :], y[self.listened :]
+        return self._record(len(self.turns) - 1, self.period, Excitation.SETPOINT, self._control())
 
     def _past(self) -> Past:
         """The record so far for a forecast; PV, set-point and MV are deviations from rest."""

@@ -11,7 +11,7 @@ from loopwright.tuning.experiments.half_wave import HalfWaves, has_moved
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, held, no_oscillation
 from loopwright.tuning.fast.experiment import VERIFICATION_PERIODS, Experiment
 from loopwright.tuning.fast.proposal import RelayFigures
-from loopwright.tuning.fast.record import MIN_SWITCHES, ExperimentRecord, oscillation_period, period
+from loopwright.tuning.fast.record import MIN_SWITCHES, Excitation, ExperimentRecord, oscillation_period, period
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import (
     Command,
@@ -153,19 +153,7 @@ class RelayTest(Experiment):
 
     def experiment_record(self) -> ExperimentRecord:
         """The record so far, as deviations from rest. Raises Refused as `ExperimentRecord` and `oscillation_period`."""
-        u, y = self._deviations()
-        return ExperimentRecord(
-            Ts=self.facts.sample_time_s,
-            u=u,
-            y=y,
-            direction=self._direction,
-            listened=self.listened,
-            excited=self.excited if self._stepping else len(self.trace),
-            turns=len(self.switches),
-            period=oscillation_period(self.switches),
-            steps=tuple(self._steps),
-            control=self._control(),
-        )
+        return self._record(len(self.switches), oscillation_period(self.switches), Excitation.RELAY, self._control())
 
     def _on_sample(self, sample: Sample) -> tuple[Command, ...]:
         """Records one sample and returns the commands that follow from it."""
