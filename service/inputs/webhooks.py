@@ -6,14 +6,11 @@ import base64
 import binascii
 from collections.abc import Iterable
 from enum import StrEnum
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Self
 from urllib.parse import SplitResult, urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
-
-from loopwright.service.inputs.public_addresses import is_public
 
 _SECRET_BYTES = range(24, 65)
 """Lengths that Standard Webhooks permits for a secret."""
@@ -31,8 +28,7 @@ class WebhookConfig(BaseModel):
     """A webhook.
 
     secret_file: a file with the secret that both sides know: base64, perhaps after `whsec_`; relative to loops.yaml.
-    allow_http: whether the address may begin with http. allow_private: whether it may lead into a private network, or
-    to this machine.
+    allow_http: whether the address may begin with http.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -42,7 +38,6 @@ class WebhookConfig(BaseModel):
     secret_file: str = Field(min_length=1)
     events: tuple[WebhookEvent, ...] = Field(default=tuple(WebhookEvent), min_length=1)
     allow_http: bool = False
-    allow_private: bool = False
 
     @field_validator("url")
     @classmethod
@@ -59,12 +54,6 @@ class WebhookConfig(BaseModel):
         parts = urlsplit(self.url)
         if parts.scheme == "http" and not self.allow_http:
             raise ValueError("url begins with http, which anybody on the way can read: use https, or allow_http: true")
-        try:
-            address = ip_address(parts.hostname or "")
-        except ValueError:
-            return self  # a name: what it leads to is looked at before each connection
-        if not self.allow_private and not is_public(address):
-            raise ValueError(f"url leads to {address}, which is not public: allow_private: true permits it")
         return self
 
     @property

@@ -78,7 +78,7 @@ class Sender:
         config = self._config
         sent = headers(message.id, self._clock.now_s(), message.body, self._secret)
         try:
-            status = post(config.url, sent, message.body.encode(), config.allow_private)
+            status = post(config.url, sent, message.body.encode())
             why = None if 200 <= status < 300 else _words(status)
         except NotDelivered as error:
             status, why = 0, str(error)

@@ -1,4 +1,4 @@
-"""Webhooks against receivers that really listen: signed, tried again, never led into the plant's own network."""
+"""Webhooks against receivers that really listen: signed, tried again, never sent on by a redirect."""
 
 from __future__ import annotations
 
@@ -13,14 +13,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from loopwright.service.inputs.config import ConfigError, parse_site
-from loopwright.service.inputs.public_addresses import is_public
 from loopwright.service.inputs.request import retune_request
 from loopwright.service.inputs.webhooks import BadSecret, WebhookConfig, read_secret
 from loopwright.service.live.webhooks import connection
@@ -92,7 +90,7 @@ def hanging() -> Iterator[str]:
 
 
 def config(url: str, **changes: Any) -> WebhookConfig:
-    entry = {"name": "plant-it", "url": url, "secret_file": "secret", "allow_http": True, "allow_private": True}
+    entry = {"name": "plant-it", "url": url, "secret_file": "secret", "allow_http": True}
     return WebhookConfig.model_validate(entry | changes)
 
 
@@ -198,31 +196,9 @@ def test_a_webhook_that_hangs_delays_nothing(
     assert time.monotonic() - begun < 30.0, "nor the end of the service"
 
 
-def test_the_whole_request_has_one_time(hanging: str) -> None:
+def test_no_answer_is_waited_for_so_long_only(hanging: str) -> None:
     with pytest.raises(NotDelivered, match=r"no answer within 0\.1 s"):
-        post(hanging, {}, b"{}", allow_private=True, timeout_s=0.1)
-
-
-def test_a_receiver_that_drips_is_cut_off() -> None:
-    def drip(server: socket.socket) -> None:
-        server.settimeout(60.0)
-        caller, _ = server.accept()
-        with caller:
-            caller.settimeout(60.0)
-            try:
-                caller.sendall(b"HTTP/1.1 200 OK\r\n")
-                while True:
-                    caller.sendall(b"X: y\r\n")
-                    time.sleep(0.02)
-            except OSError:
-                pass
-
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        thread = threading.Thread(target=drip, args=(server,))
-        thread.start()
-        with pytest.raises(NotDelivered, match="no answer"):
-            post(f"http://127.0.0.1:{server.getsockname()[1]}/", {}, b"{}", allow_private=True, timeout_s=3.0)
-        thread.join()
+        post(hanging, {}, b"{}", timeout_s=0.1)
 
 
 def test_a_redirect_is_not_followed(service: Service, tmp_path: Path, receiver: Callable[..., Receiver]) -> None:
@@ -234,37 +210,6 @@ def test_a_redirect_is_not_followed(service: Service, tmp_path: Path, receiver: 
     assert not inside.received
     (message,) = webhook_deliveries.latest(service.store, 1)
     assert message.error is not None and "redirects are not followed" in message.error
-
-
-def test_a_name_that_leads_to_this_machine_is_not_called(receiver: Callable[..., Receiver]) -> None:
-    hook = receiver(200)
-    url = hook.url.replace("127.0.0.1", "localhost")
-    with pytest.raises(NotDelivered, match=r"localhost leads to .*127\.0\.0\.1, which is not public"):
-        post(url, {}, b"{}", allow_private=False)
-    assert not hook.received
-    assert post(url, {}, b"{}", allow_private=True) == 200
-
-
-def test_a_name_is_resolved_once(receiver: Callable[..., Receiver], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A name that is public when it is looked at and leads here a moment later: the first address is the one called."""
-    hook, asked, called = receiver(200), [], []
-    real = socket.getaddrinfo
-
-    def rebinding(host: str, port: int, *rest: Any, **more: Any) -> Any:
-        if host != "hook.example.com":
-            return real(host, port, *rest, **more)
-        asked.append(host)
-        return real("93.184.215.14" if len(asked) == 1 else "127.0.0.1", port, *rest, **more)
-
-    def connect(address: tuple[str, int], *_: Any, **__: Any) -> socket.socket:
-        called.append(address[0])
-        raise ConnectionRefusedError("nothing is called from this test")
-
-    monkeypatch.setattr(socket, "getaddrinfo", rebinding)
-    monkeypatch.setattr(socket, "create_connection", connect)
-    with pytest.raises(NotDelivered):
-        post(hook.url.replace("127.0.0.1", "hook.example.com"), {}, b"{}", allow_private=False)
-    assert (asked, called) == (["hook.example.com"], ["93.184.215.14"])
 
 
 def test_what_was_not_delivered_is_delivered_after_a_restart(
@@ -358,23 +303,8 @@ def test_a_message_does_not_wait_for_a_clock_that_is_set_back(
     assert states(service.store) == [("plant-it", "delivered", 2)]
 
 
-@pytest.mark.parametrize(("address", "public"), [
-    ("93.184.215.14", True), ("2606:2800:21f:cb07:6820:80da:af6b:8b2c", True),
-    ("127.0.0.1", False), ("10.1.2.3", False), ("192.168.0.9", False), ("172.20.0.1", False),
-    ("169.254.169.254", False), ("100.64.0.1", False), ("0.0.0.0", False), ("224.0.0.1", False),
-    ("255.255.255.255", False),
-    ("::1", False), ("::", False), ("fe80::1", False), ("fc00::1", False), ("ff02::1", False),
-    ("::ffff:127.0.0.1", False), ("::ffff:10.0.0.1", False), ("64:ff9b::7f00:1", False), ("2002:7f00:1::", False),
-    ("::ffff:93.184.215.14", True),
-])  # fmt: skip
-def test_which_addresses_are_public(address: str, public: bool) -> None:
-    assert is_public(ip_address(address)) is public
-
-
 @pytest.mark.parametrize(("entry", "why"), [
     ({"url": "http://example.com/hook"}, "url begins with http"),
-    ({"url": "https://127.0.0.1/hook"}, "127.0.0.1, which is not public"),
-    ({"url": "https://[::ffff:10.0.0.1]/hook"}, "which is not public"),
     ({"url": "https://me:word@example.com/"}, "no name and no password"),
     ({"url": "example.com/hook"}, "an address of the form https://HOST/PATH"),
     ({"url": "https://example.com:0/hook"}, "an address of the form"),
