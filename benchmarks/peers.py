@@ -46,11 +46,11 @@ from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.five_stage.procedure import Options, five_stage
 from loopwright.tuning.five_stage.relay import relay_test
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.identification.step_fits import fit_step
 from loopwright.tuning.models import integrators
 from loopwright.tuning.plan import Plan, StageStarted
 from loopwright.tuning.reasons import Ended
 from loopwright.tuning.rules.registry import METHODS
+from validation.step_fits import fit_step
 
 SAMPLES = 1500
 """Of a step's record at most: a longer one is of averages."""

@@ -11,7 +11,6 @@ from scipy.optimize import brentq
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.analysis.step_response import step_figures, step_response
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.identification.step_fits import fit_closed_loop, fit_step
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.reduction.half_rule import half_rule
 from loopwright.tuning.reduction.moments_and_areas import two_areas
@@ -22,6 +21,7 @@ from validation.checks import Cell, Column, Figure, Paper, Row, Table
 from validation.fifty_models import FiftyModels
 from validation.loops import FIVE_LAGS, plant
 from validation.references import References
+from validation.step_fits import fit_closed_loop, fit_step
 
 DESIGNED_FOR_THE_PLANT = Gains(Kp=0.887, Ti=0.887 / 0.225)
 TABLE_4_HORIZON_S = 40.0

@@ -99,7 +99,6 @@ class _Comparison:
         fast = float(np.sqrt(np.mean(np.diff(pv, 2) ** 2) / 6.0))  # what is left of PV without its slow changes
         noise = max(noise_of(rest), fast) if len(rest) >= MIN_AT_REST else fast
         self._noise = math.hypot(noise, NEGLIGIBLE_RESIDUAL / MAX_RESIDUAL * float(np.ptp(pv))) or 1.0
-        self._begun_s = (move - first) * stretch.Ts
         self._length_s = (end - move) * stretch.Ts
         nominal = self._answer(model.plant)
         self._nominal = nominal

@@ -11,12 +11,12 @@ import pytest
 
 from loopwright.tuning.analysis.step_response import step_response
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.identification.step_fits import fit_closed_loop, fit_step
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.reduction.half_rule import half_rule
 from loopwright.tuning.reduction.moments_and_areas import moments, two_areas
 from tests.unit.tuning.tables import EQUIPOLE5, TABLES
+from validation.step_fits import fit_closed_loop, fit_step
 
 PLANTS_PI = Gains(Kp=0.887, Ti=0.887 / 0.225)
 # five equal lags: 1 - y is the tail of a Poisson sum
