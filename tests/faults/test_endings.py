@@ -98,8 +98,8 @@ def stands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stands]:
 @pytest.mark.parametrize(("fault", "stage"), EXPECTED)
 def test_the_loop_ends_safe_and_the_job_says_why(fault: str, stage: str, stands: Stands) -> None:
     one = campaign.calm_ending(stands.with_needs(ALL_FAULTS[fault].needs), fault, stage)
-    assert not one.bad, one
-    assert f"{one.state} {one.reason}" in EXPECTED[fault, stage], one
+    assert not one.bad, str(one)
+    assert f"{one.state} {one.reason}" in EXPECTED[fault, stage], str(one)
     assert one.kept > 0
     assert (one.attempts > 1) == (fault in ("service-killed", "killed-twice", "second-gateway"))
     if one.state == "proposed" and one.attempts == 1:
@@ -121,7 +121,7 @@ WATCHED_ENDS = {
 @pytest.mark.parametrize(("fault", "moment"), WATCHED_ENDS)
 def test_a_watched_loop_never_has_gains_that_nobody_decided_on(fault: str, moment: str, stands: Stands) -> None:
     one = campaign.calm_ending(stands.with_needs(ALL_FAULTS[fault].needs), fault, moment)
-    assert not one.bad, one
+    assert not one.bad, str(one)
     assert one.state in WATCHED_ENDS[fault, moment], one
 
 
