@@ -1,4 +1,4 @@
-"""docs/simulation.md: what was simulated, how it ended, what was found."""
+"""docs/simulation.md: what was simulated, and how it ended."""
 
 from __future__ import annotations
 
