@@ -165,7 +165,7 @@ class _Demo:
         _say(f"pictures         {', '.join(str(folder / f'{job.method}.png') for job in shown.jobs)}")
         _say(f"jobs, samples    {folder / 'data' / 'loopwright.sqlite'}")
         _say(f"configuration    {folder / 'loops.yaml'}")
-        _say("next             docs/rest.md: the same by hand; docs/one-job.md: how it works")
+        _say("next             docs/rest.md: the same by hand; docs/jobs.md: how it works")
         self.shown = shown
         if options.goes_on:
             self._go_on(client.url, shown, folder)

@@ -1,4 +1,4 @@
-"""docs/simulation.md: what was simulated, how it ended, what was found."""
+"""docs/simulation.md: what was simulated, and how it ended."""
 
 from __future__ import annotations
 
@@ -35,17 +35,27 @@ def _numbers(endings: Sequence[Ending], seeds: int, took_s: float) -> str:
         f"{seeds:,} seeds and {exhaustive:,} kills at each call of one job: {hours:.0f} h of bus time, {steps:,} calls "
         f"that could have been a service's last, in {took_s / 60.0:.0f} min on {_machine()}. **{bad} bad**.",
         "",
-        *_markdown(table(endings)),
+        *_by_kind(table(endings)),
         "",
-        "What the kinds are:",
-        "",
-        *(f"- `{name}`: {kind.words}" for name, kind in KINDS.items()),
-        "",
-        "How the jobs ended, the most frequent first:",
-        "",
-        *_markdown([["state, reason", "jobs"], *([name, f"{count:,}"] for name, count in reasons.most_common(30))]),
+        _ends(reasons),
     ]
     return "\n".join(lines)
+
+
+def _by_kind(rows: list[list[str]]) -> list[str]:
+    """Of the table of kinds and ends: how many histories of each kind, and how many of them ended badly."""
+    histories, bad = rows[0].index("histories"), rows[0].index("bad")
+    shown = [["kind", "histories", "bad"]]
+    for name, *counts in rows[1:]:
+        words = f"`{name}`: {KINDS[name].words}" if name in KINDS else name
+        shown.append([words, counts[histories - 1], counts[bad - 1]])
+    return _markdown(shown)
+
+
+def _ends(reasons: Counter[str]) -> str:
+    """The 30 most frequent, in one line."""
+    ends = ", ".join(f"{name.replace(', ', ' ')} {count:,}" for name, count in reasons.most_common(30))
+    return f"How the jobs ended, the most frequent first: {ends}."
 
 
 def _markdown(rows: list[list[str]]) -> list[str]:

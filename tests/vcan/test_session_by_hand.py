@@ -1,6 +1,6 @@
 """A whole session with a master that nobody here wrote: the client of `canopen`, our EDS, and zlib for the check.
 
-Everything is written as somebody would who has the EDS and docs/canopen-profile.md before them, and none of our code.
+Everything is written as somebody would who has the EDS and decision 8 before them, and none of our code.
 """
 
 from __future__ import annotations

@@ -15,9 +15,9 @@ from loopwright.tuning.reasons import ADVICE
 
 ROOT = Path(__file__).parents[3]
 FILES = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
-DATED = ("CHANGELOG.md", "docs/decisions/")
-"""These tell of the time in which they were written."""
-DOCUMENTS = [name for name in FILES if name.endswith(".md") and not name.startswith(DATED)]
+DATED = "CHANGELOG.md"
+"""It tells of the time in which it was written."""
+DOCUMENTS = [name for name in FILES if name.endswith(".md") and name != DATED]
 OF_THE_READER = {"plant.json", "loops.yaml", "/openapi.json"}
 TARGETS = set(re.findall(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[0].split())
 COMMANDS = set(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
