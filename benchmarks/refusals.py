@@ -119,7 +119,7 @@ def cases() -> dict[str, Case]:
             "T95 is stated as 26 s; the lag is 240 s", num=(1.0,), den=(240.0, 1.0), dead_time_s=20.0
         ),
         "stalled": Case("a load of twice the relay comes in its second period", mv=_load(60.0, 12.0)),
-        "unexplained": Case("the valve sticks: it moves only when pushed by 12 %", mv=Sticking(12.0), seed=2),
+        "unexplained": Case("the valve sticks: it moves only when pushed by 12 %", mv=Sticking(12.0)),
         "disturbed": Case(
             "another loop swings, and moves PV by a little more than its noise",
             pv=lambda pv, t: pv + 0.03 * math.sin(3.0 * t), noise=0.03,

@@ -74,14 +74,6 @@ class Column:
         own = len(repr(float(value)).partition(".")[2]) if value is not None else 0
         return f"{value:.{own}f}" if own > self.decimals else self.show(value)
 
-    def difference(self, cell: Cell) -> str:
-        """Of ours as shown."""
-        if cell.given or cell.ours is None or cell.printed is None:
-            return "–"
-        off = round(cell.ours, self.decimals) - cell.printed
-        shown = self.show(off)
-        return shown if off < 0.0 or float(shown) == 0.0 else f"+{shown}"
-
     def verdict(self, cell: Cell) -> Verdict:
         if cell.given:
             return Verdict.GIVEN

@@ -10,22 +10,20 @@ INTRODUCTION = """\
 # Validation against the five papers
 
 Written by `make validate`, which recomputes every printed table and example of the papers that Loopwright's methods
-come from, with the same `tuning/` that tunes loops. It fails when a number leaves its tolerance. A test compares this
-text with what the run gives, so it is never out of date.
+come from, with the same `tuning/` that tunes loops. It fails when a number leaves its tolerance, and a test compares
+this text with what the run gives.
 
-How to read a table. A line is a row of the paper's table, its numbers in the order that the line above the table gives;
-the difference is of the numbers as shown, rounded to what the tolerance supports. The verdict is on the unrounded ones:
+A line is a row of the paper's table, its numbers in the order that the line above the table gives, rounded to what the
+tolerance supports; the verdict is on the unrounded ones.
 
 - **reproduced**: within the tolerance stated below the table, with its reason.
-- **explained (a)**: not within it. The cause stands below the table. A cause alone does not pass: our number must agree
-  with an independent calculation (made with other code, its results are in `tests/data/`), and it fails when the print
-  is met after all.
+- **explained (a)**: not within it, for the cause below the table. Our number must then agree with an independent
+  calculation (other code, its results are in `tests/data/`), and it fails when the print is met after all.
 - **cannot be recomputed (a)**: the paper does not state what the number follows from.
 - **agrees**: with an independent calculation, where the paper prints no number.
 - *given*: an input that we take from the print.
 
-Dead times are exact everywhere, never a Pade approximant; the plots are our simulations, not copies of the papers'
-figures.
+Dead times are exact, never a Pade approximant; the plots are our simulations.
 """
 
 SUMMED = (Verdict.REPRODUCED, Verdict.AGREES, Verdict.EXPLAINED, Verdict.LOST, Verdict.FAILED)
@@ -80,13 +78,12 @@ def _of_claim(claim: Claim) -> str:
 def _table(table: Table) -> list[str]:
     names = ", ".join(f"{each.name} ({each.unit})" if each.unit else each.name for each in table.columns)
     lines = [f"### {table.title}", "", *([table.text, ""] if table.text else []), f"Numbers: {names}.", ""]
-    lines += [f"| row | {table.reference} | ours | difference | verdict |", "| --- | ---: | ---: | ---: | --- |"]
+    lines += [f"| row | {table.reference} | ours | verdict |", "| --- | ---: | ---: | --- |"]
     for row in table.rows:
         pairs = list(zip(table.columns, row.cells, strict=True))
         printed = (_reference(table, column, cell) for column, cell in pairs)
         ours = ("*given*" if cell.given else column.show(cell.ours) for column, cell in pairs)
-        off = (column.difference(cell) for column, cell in pairs)
-        lines.append(f"| {row.label} | {_row(printed)} | {_row(ours)} | {_row(off)} | {_verdict(table, row)} |")
+        lines.append(f"| {row.label} | {_row(printed)} | {_row(ours)} | {_verdict(table, row)} |")
     lines += ["", f"Tolerance: {_tolerances(table)}.", ""]
     lines += [f"- ({key}) {text}" for key, text in sorted(table.causes.items())]
     return [*lines, ""] if table.causes else lines

@@ -27,18 +27,32 @@ HEAD = (
 def line(case: str, runs: Sequence[TroubledRun]) -> str:
     """One row of the table in Markdown."""
     trouble = TROUBLES[case]
-    acts = "later" if trouble.later else "within"
+    return f"| {trouble.kind} | {trouble.level} | {columns(trouble.later, runs)}"
+
+
+def columns(later: bool, runs: Sequence[TroubledRun]) -> str:
+    """The figures of a row, from the third column on."""
+    acts = "later" if later else "within"
     proposed = [each for each in runs if each.reason is None]
     stable = [each.Ms for each in proposed if each.Ms is not None]
     span = f"{min(stable):.2f} .. {max(stable):.2f}" if stable else "-"
     causes = Counter(each.reason for each in runs if each.reason is not None).most_common()
     passed = [each.passed for each in proposed]
+    over = sum(each.over > TOO_FAR for each in proposed)
     return (
-        f"| {trouble.kind} | {trouble.level} | {acts} | {len(proposed)}/{len(runs)} | "
-        f"{span} | {sum(each.over > TOO_FAR for each in proposed)}/{len(proposed)} | {len(proposed) - len(stable)} | "
+        f"{acts} | {len(proposed)}/{len(runs)} | {span} | {over}/{len(proposed)} | {len(proposed) - len(stable)} | "
         f"{', '.join(f'{cause} {count}' for cause, count in causes) or '-'} | "
         f"{f'{np.median(passed):.1f} / {max(passed):.1f}' if passed else '-'} |"
     )
+
+
+def of_kinds(runs: Sequence[TroubledRun]) -> Iterator[str]:
+    """The same table with all levels of a kind in one row, as `docs/trouble.md` has it."""
+    yield HEAD.replace("level", "levels", 1)
+    for kind, later in dict.fromkeys((each.kind, each.later) for each in TROUBLES.values()):
+        of_kind = [each for each in runs if TROUBLES[each.case].kind == kind and TROUBLES[each.case].later == later]
+        if of_kind:
+            yield f"| {kind} | {len({each.case for each in of_kind})} | {columns(later, of_kind)}"
 
 
 def summary(runs: Sequence[TroubledRun]) -> Iterator[str]:
@@ -61,6 +75,8 @@ def table(runs: Sequence[TroubledRun]) -> Iterator[str]:
     for case in TROUBLES:
         if of_case := [each for each in runs if each.case == case]:
             yield line(case, of_case)
+    yield ""
+    yield from of_kinds(runs)
     yield ""
     yield from summary(runs)
 

@@ -265,9 +265,10 @@ def test_trouble_is_all_the_cases_a_kind_its_own_and_another_name_none() -> None
     assert not TROUBLES["second path: 0.3 of the effect 2 Pu later"].later
 
 
-def test_a_table_has_a_row_for_each_case_and_sums_up_the_two_classes() -> None:
-    within, later = "none: linear", "recirculation: 0.8 comes back 4 Pu later"
+def test_a_table_has_a_row_for_each_case_and_each_kind_and_sums_up_the_two_classes() -> None:
+    within, noisy, later = "none: linear", "none: 5 % noise", "recirculation: 0.8 comes back 4 Pu later"
     runs = [
+        TroubledRun(noisy, PLANT.name, "fast", 1, 6.0, 1.0, Ms=1.58),
         TroubledRun(within, PLANT.name, "fast", 1, 5.0, 1.0, Ms=1.61),
         TroubledRun(within, PLANT.name, "fast", 2, 5.5, 1.0),
         TroubledRun(within, PLANT.name, "fast", 3, 2.0, 1.0, reason="uncertain"),
@@ -277,7 +278,8 @@ def test_a_table_has_a_row_for_each_case_and_sums_up_the_two_classes() -> None:
     assert head.startswith("| kind | level |")
     assert rows[0].startswith("| recirculation | 0.8 comes back 4 Pu later | later | 1/1 | 2.10 .. 2.10 | 1/1 | 0 |")
     assert rows[1] == "| none | linear | within | 2/3 | 1.61 .. 1.61 | 1/2 | 1 | uncertain 1 | 5.2 / 5.5 |"
-    assert rows[-2].endswith("in 1 of the proposals (50.0 %), 1 of them unstable.")
+    assert "| none | 2 | within | 3/4 | 1.58 .. 1.61 | 1/3 | 1 | uncertain 1 | 5.5 / 6.0 |" in rows
+    assert rows[-2].endswith("in 1 of the proposals (33.3 %), 1 of them unstable.")
     assert "later than the record: 1 runs, 1 proposed, Ms over 1.6 + 0.3 in 1 of the proposals (100.0 %), 0" in rows[-1]
 
 
