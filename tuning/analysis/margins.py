@@ -30,13 +30,16 @@ CROSSINGS = 40
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """The stability margins of a loop. A margin without its crossover is None, and so is its frequency.
+    """The stability margins of a loop. A margin without its crossover is None, and so is its frequency. The frequencies
+    have the names of `control.stability_margins`.
 
     GM: the gain margin, a ratio: the smallest factor above one that takes a stable loop to its stability limit.
     PM_deg: the phase margin, degrees.
     Ms, Mt: the peaks of |1/(1+L)| and |L/(1+L)|.
-    wc, wpc: the gain crossover and the phase crossover, rad/s.
-    ws: the frequency of the peak Ms, rad/s; the highest one looked at where |1/(1+L)| is largest in the limit.
+    delay_margin_s: the smallest further dead time that takes the loop to its stability limit, s; None for a loop that
+    is not stable, or that no dead time makes unstable.
+    wgc, wpc: the gain crossover and the phase crossover, rad/s.
+    wms: the frequency of the peak Ms, rad/s; the highest one looked at where |1/(1+L)| is largest in the limit.
     bandwidth: the frequency at which |L/(1+L)| first falls to 1/sqrt(2) of its value at rest, rad/s.
     stable: whether the loop is stable, exactly (see `tuning.analysis.stability`). The other figures of an unstable loop
     describe the curve and are no margins.
@@ -46,18 +49,12 @@ class Margins:
     PM_deg: float | None
     Ms: float
     Mt: float
-    wc: float | None
+    delay_margin_s: float | None
+    wgc: float | None
     wpc: float | None
-    ws: float
+    wms: float
     bandwidth: float | None
     stable: bool
-
-    @property
-    def delay_margin_s(self) -> float | None:
-        """The additional dead time at which the loop reaches its stability limit at the gain crossover wc, s."""
-        if self.PM_deg is None or self.wc is None:
-            return None
-        return math.radians(self.PM_deg) / self.wc
 
 
 def margins(model: Model, gains: Gains) -> Margins:
@@ -101,32 +98,30 @@ def margins(model: Model, gains: Gains) -> Margins:
         if size > inverse_gm and not (stable and size >= 1.0):
             wpc, inverse_gm = x, size
 
-    wc, pm = None, None
+    wgc, pm, delay = None, None, math.inf
     everywhere = np.ones(w.shape, dtype=bool)
     for x in _crossings(lambda v: np.log(np.abs(loop(v))), w, np.log(np.abs(L)), everywhere, np.abs(L)):
-        here = abs(float(np.degrees(np.angle(-at(x)))))
-        if pm is None or here < pm:
-            wc, pm = x, here
+        angle = float(np.angle(-at(x)))
+        if pm is None or abs(angle) < math.radians(pm):
+            wgc, pm = x, abs(math.degrees(angle))
+        # a dead time turns the curve clockwise; farther up a smaller one is enough
+        delay = min(delay, angle % (2.0 * math.pi) / x)
 
     gain, nearest = _at_infinity(model, N, D)
+    if gain >= 1.0:
+        delay = 0.0
     return Margins(
         GM=1.0 / inverse_gm if inverse_gm > 0.0 else None,
         PM_deg=pm,
         Ms=1.0 / max(min(minimum, nearest), 1e-12),
         Mt=max(-mt, gain / max(nearest, 1e-12)),
-        wc=wc,
+        delay_margin_s=delay if stable and delay < math.inf else None,
+        wgc=wgc,
         wpc=wpc,
-        ws=ws,
+        wms=ws,
         bandwidth=_bandwidth(loop, w, closed, N, D),
         stable=stable,
     )
-
-
-def delay_margin_s(model: Model, gains: Gains) -> float | None:
-    """The delay margin of the loop, s; None for a loop that is not stable, or has no gain crossover. Raises as
-    `margins`."""
-    found = margins(model, gains)
-    return found.delay_margin_s if found.stable else None
 
 
 @dataclass(frozen=True, slots=True)

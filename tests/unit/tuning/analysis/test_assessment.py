@@ -74,7 +74,7 @@ def test_the_loop_of_direct_synthesis(row: dict[str, Any]) -> None:
     assert figures is not None
     assert pytest.approx(math.pi / (2.0 * c), rel=1e-6) == m.GM
     assert m.PM_deg == pytest.approx(90.0 - math.degrees(c), abs=1e-4)
-    assert m.wc == pytest.approx(c / theta, rel=1e-6)
+    assert m.wgc == pytest.approx(c / theta, rel=1e-6)
     assert m.delay_margin_s == pytest.approx((math.pi / 2.0 - c) / c * theta, rel=1e-5)
     assert m.Ms == pytest.approx(row["Ms"], rel=1e-4)
     assert pytest.approx(theta * math.cos(c) / (2.0 * c * (1.0 - math.sin(c))), rel=1e-3) == figures.ISE

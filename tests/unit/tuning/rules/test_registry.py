@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from loopwright.tuning.fast.tuned import METHODS as ALL
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.registry import METHODS, Method, Option, tune
@@ -35,11 +36,11 @@ def refusal(name: str, model: Model, **options: Any) -> Refused:
 
 
 def test_the_list() -> None:
-    assert list(METHODS) == NAMES
-    assert all(method.name == name for name, method in METHODS.items())
+    assert list(METHODS) == NAMES and list(ALL) == [*NAMES, "fast"]
+    assert all(method.name == name for name, method in ALL.items())
 
 
-@pytest.mark.parametrize("method", METHODS.values(), ids=NAMES)
+@pytest.mark.parametrize("method", ALL.values(), ids=list(ALL))
 def test_every_method_is_described(method: Method) -> None:
     assert all((method.title, method.source, method.needs, method.takes))
     assert method.for_what.endswith(".")
@@ -51,11 +52,11 @@ def test_the_documented_table() -> None:
     shown = [line for line in lines if line.startswith("| `")]
     assert shown == [
         f"| `{m.name}` | {m.for_what} | {m.needs} | {', '.join(f'`{name}`' for name in m.options)} |"
-        for m in METHODS.values()
+        for m in ALL.values()
     ]
 
 
-@pytest.mark.parametrize("method", METHODS.values(), ids=NAMES)
+@pytest.mark.parametrize("method", ALL.values(), ids=list(ALL))
 def test_options_are_those_of_the_rule(method: Method) -> None:
     """Same names, same defaults: what is shown is what is used."""
     keywords = {
