@@ -46,7 +46,7 @@ def half_rule(model: Model, order: Literal[1, 2] = 1) -> FOPDT | SOPDT | Integra
         return Integrating(gain, dead, lags[0] if lags else 0.0)
     if len(lags) == 1:
         return FOPDT(gain, lags[0], dead)
-    return SOPDT.of_time_constants(gain, lags[0], lags[1], dead)
+    return SOPDT(K=gain, T1=lags[0], T2=lags[1], L=dead)
 
 
 def exact(model: TransferFunction) -> Model:

@@ -104,7 +104,7 @@ def test_a_lag_without_dead_time_in_closed_form(K: float) -> None:
 @pytest.mark.parametrize("K", [1e3, 1e5, 1e9])
 def test_two_lags_without_dead_time_in_closed_form(K: float) -> None:
     # closed loop: (x^2 + 2x)/(x^2 + 2x + 1 + K) for x = 10 s, a peak of about sqrt(K)/2
-    found = margins(SOPDT.of_time_constants(1.0, 10.0, 10.0, 0.0), Gains(K))
+    found = margins(SOPDT(K=1.0, T1=10.0, T2=10.0, L=0.0), Gains(K))
     wc = math.sqrt(K - 1.0) / 10.0
     assert found.wgc == pytest.approx(wc, rel=1e-9)
     assert found.PM_deg == pytest.approx(180.0 - 2.0 * math.degrees(math.atan(10.0 * wc)), abs=1e-6)

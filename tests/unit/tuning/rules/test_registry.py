@@ -23,7 +23,7 @@ QUICK = [name for name in NAMES if name != "me-pso"]
 
 SAMPLES: dict[type[Model], Model] = {
     FOPDT: FOPDT(2.0, 10.0, 4.0),
-    SOPDT: SOPDT.of_time_constants(2.0, 10.0, 3.0, 2.0),
+    SOPDT: SOPDT(K=2.0, T1=10.0, T2=3.0, L=2.0),
     Integrating: Integrating(0.1, 2.0),
     TransferFunction: TransferFunction((-0.5, 1.0), (1.0, 3.0, 3.0, 1.0), 1.0),
 }
@@ -98,7 +98,7 @@ def test_reduction_is_noted() -> None:
     assert "second order with K = 1, T1 = 1.5 s, T2 = 1 s, L = 1 s" in tune("direct-synthesis", third).notes[0]
     assert (
         "tangent to first order with K = 2, T = 20 s, L = 2.931 s"
-        in (tune("zn-step", SOPDT.of_time_constants(2.0, 10.0, 5.0, 1.0)).notes[0])
+        in (tune("zn-step", SOPDT(K=2.0, T1=10.0, T2=5.0, L=1.0)).notes[0])
     )
     lagged = tune("lambda", Integrating(0.1, 1.0, 1.0), lambda_s=6.0)
     assert lagged.gains == tune("lambda", Integrating(0.1, 2.0), lambda_s=6.0).gains
