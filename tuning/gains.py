@@ -52,10 +52,10 @@ class Gains:
 
 
 class WithGains(Protocol):
-    """What has been found with gains, such as the result of `tune`."""
+    """What has been found with gains, such as the result of `tune`; None where none were found."""
 
     @property
-    def gains(self) -> Gains: ...
+    def gains(self) -> Gains | None: ...
 
 
 AnyGains = Gains | WithGains
@@ -68,6 +68,8 @@ def as_gains(given: AnyGains) -> Gains:
         return given
     if isinstance(found := getattr(given, "gains", None), Gains):
         return found
+    if hasattr(given, "gains"):
+        raise TypeError(f"this {type(given).__name__} has no gains: {given!r}")
     raise TypeError(f"{type(given).__name__} has no gains: give Gains(Kp=..., Ti=...), or a result of tune")
 
 

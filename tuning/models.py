@@ -236,10 +236,10 @@ class LinearSystem(Protocol):
 
 
 class WithModel(Protocol):
-    """What has been found with a model, such as the result of `identify`."""
+    """What has been found with a model, such as the result of `identify`; None where none was found."""
 
     @property
-    def model(self) -> Model: ...
+    def model(self) -> Model | None: ...
 
 
 AnyModel = Model | LinearSystem | WithModel | tuple[ArrayLike, ArrayLike] | Mapping[str, Any]
@@ -262,6 +262,8 @@ def as_model(system: AnyModel, dead_time_s: float = 0.0) -> Model:
         system = _by_names(system)
     elif isinstance(found := getattr(system, "model", None), Model):
         system = found
+    elif found is None and hasattr(system, "model"):
+        raise TypeError(f"this {type(system).__name__} has no model: {system!r}")
     if isinstance(system, Model):
         if dead_time_s:
             raise ValueError(

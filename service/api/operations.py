@@ -185,9 +185,7 @@ def install(
     def get_metrics() -> Response:
         return Response(metrics.exposition(counted), media_type=metrics.MEDIA_TYPE)
 
-    @router.get(
-        "/audit", summary="The audit trail, latest change first", responses={**LINK, **problems.responses(422)}
-    )
+    @router.get("/audit", summary="The audit trail, latest change first", responses={**LINK, **problems.responses(422)})
     def list_changes(
         response: Response,
         limit: Limit = 100,

@@ -109,6 +109,14 @@ def latest(store: Store, limit: int, before: int | None = None) -> list[Delivery
 
 def _delivery(row: Row) -> Delivery:
     return Delivery(
-        row.id, row.hook, row.job_id, row.body, row.at, DeliveryState(row.state), row.attempts, row.due_s, row.error,
+        row.id,
+        row.hook,
+        row.job_id,
+        row.body,
+        row.at,
+        DeliveryState(row.state),
+        row.attempts,
+        row.due_s,
+        row.error,
         row.number,
     )

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 
 from loopwright.tuning.analysis.stability import is_stable, open_loop
-from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import Complexes, Model, Reals
+from loopwright.tuning.gains import AnyGains, Gains, as_gains
+from loopwright.tuning.models import AnyModel, Complexes, Model, Reals, as_model
 from loopwright.tuning.reasons import Reason, Refused
 
 POINTS_PER_DECADE = 600
@@ -57,32 +57,31 @@ class Margins:
     stable: bool
 
 
-def margins(model: Model, gains: Gains) -> Margins:
+def margins(model: AnyModel, gains: AnyGains) -> Margins:
     """The margins of the loop of this model and these gains; Tf = 0 is the ideal derivative.
 
-    Raises Refused, BAD_INPUT: gains out of range, or an ideal derivative on a bi-proper plant.
+    Raises Refused, BAD_INPUT: gains out of range, or an ideal derivative on a bi-proper plant. Raises TypeError for
+    what is no model or has no gains.
     """
-    N, D = open_loop(model, gains)
-    stable = is_stable(model, gains)
+    plant, in_effect = as_model(model), as_gains(gains)
+    N, D = open_loop(plant, in_effect)
+    stable = is_stable(plant, in_effect)
 
     def loop(w: Reals) -> Complexes:
         s = 1j * w
-        return np.asarray(np.polyval(N, s) / np.polyval(D, s) * np.exp(-model.L * s))
+        return np.asarray(np.polyval(N, s) / np.polyval(D, s) * np.exp(-plant.L * s))
 
     def at(w: float) -> complex:
         return complex(loop(np.array([w]))[0])
 
-    roots = np.concatenate((np.roots(N), np.roots(D)))
-    w = _grid(model, N, D, roots)
-    if len(modes := _modes(roots)):
-        w = np.union1d(w, modes)
+    w = frequency_grid(plant, N, D)
     L = loop(w)
 
     def nearness(x: float) -> float:
         return abs(1.0 + at(x))
 
     ws, minimum = _min(nearness, w, int(np.argmin(np.abs(1.0 + L))))
-    turn = _turn(model, w, L, minimum) if stable else w[:0]
+    turn = _turn(plant, w, L, minimum) if stable else w[:0]
     if len(turn) and np.min(np.abs(1.0 + loop(turn))) < minimum:
         w = np.sort(np.concatenate((w, turn)))
         L = loop(w)
@@ -107,7 +106,7 @@ def margins(model: Model, gains: Gains) -> Margins:
         # a dead time turns the curve clockwise; farther up a smaller one is enough
         delay = min(delay, angle % (2.0 * math.pi) / x)
 
-    gain, nearest = _at_infinity(model, N, D)
+    gain, nearest = _at_infinity(plant, N, D)
     if gain >= 1.0:
         delay = 0.0
     return Margins(
@@ -136,7 +135,7 @@ class Ultimate:
     Pu_s: float
 
 
-def ultimate_point(model: Model) -> tuple[float, float]:
+def ultimate_point(model: AnyModel) -> tuple[float, float]:
     """The ultimate point (Ku, Pu): the positive gain at which a P loop just oscillates, and the period in s.
 
     Raises Refused, CANNOT_OSCILLATE, for a model without an ultimate point.
@@ -147,9 +146,17 @@ def ultimate_point(model: Model) -> tuple[float, float]:
     return found.GM, 2.0 * math.pi / found.wpc
 
 
+def frequency_grid(model: Model, N: Reals, D: Reals) -> Reals:
+    """The frequency grid of the loop N/D with the model's dead time, rad/s: from well below the slowest to well above
+    the fastest corner, to a decade beyond the gain crossover where a high gain moves that farther up, and dense about
+    lightly damped poles and zeros."""
+    roots = np.concatenate((np.roots(N), np.roots(D)))
+    w, modes = _grid(model, N, D, roots), _modes(roots)
+    return np.asarray(np.union1d(w, modes)) if len(modes) else w
+
+
 def _grid(model: Model, N: Reals, D: Reals, roots: Complexes) -> Reals:
-    """The frequency grid, rad/s, from well below the slowest to well above the fastest corner of the loop, and to a
-    decade beyond the gain crossover where a high gain moves that farther up. roots: those of N and D."""
+    """The grid without the part about lightly damped poles and zeros. roots: those of N and D."""
     corners = [float(x) for x in np.abs(roots) if x > 0.0]
     kept = np.trim_zeros(D, "b")
     origin = len(D) - len(kept)

@@ -42,7 +42,7 @@ class Tuned:
     notes: tuple[str, ...]
     assessment: Assessment
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         g, found = self.gains, self.assessment
         derivative = f", Td {g.Td:.4g} s, Tf {g.Tf:.4g} s" if g.Td else ""
         gains = f"{self.method.title}: Kp {g.Kp:.4g}, Ti {g.Ti:.4g} s{derivative}"
@@ -99,7 +99,7 @@ class Tuned:
 
 def method_of(name: str) -> Method:
     """The method of this name in `METHODS`. Raises Refused, BAD_INPUT."""
-    if name not in METHODS:
+    if not isinstance(name, str) or name not in METHODS:
         raise Refused(Reason.BAD_INPUT, f"method must be one of {', '.join(METHODS)}, not {name!r}")
     return METHODS[name]
 
