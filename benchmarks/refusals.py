@@ -21,7 +21,7 @@ from loopwright.service.cli.plots.fast_job import fast_job
 from loopwright.service.cli.rehearsed import RehearsedJob, shown_samples
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
-from loopwright.service.execution.rehearsed import Record
+from loopwright.service.execution.rehearsed import RehearsalRecord
 from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import run
 from loopwright.service.jobs.stored_record import stored_record
@@ -139,7 +139,7 @@ def cases() -> dict[str, Case]:
     }  # fmt: skip
 
 
-def rehearsed(case: Case) -> tuple[RehearsedJob, Record]:
+def rehearsed(case: Case) -> tuple[RehearsedJob, RehearsalRecord]:
     """The job, as GET /jobs/{id} would show it, and its samples."""
     plant = Odd(case)
     settings = Settings(mv_low=0.0, mv_high=100.0, safe_output=MIDDLE, pv_low=-1e9, pv_high=1e9, reverse=case.reverse)
@@ -147,7 +147,7 @@ def rehearsed(case: Case) -> tuple[RehearsedJob, Record]:
     start = (TS, settings, _parameters(case.gains), SP, int(mode), MIDDLE)
     channel = Channel(*start) if case.other is None else OtherChannel(case.other, PERIOD_S, *start)
     loop = RehearsedLoop(plant, channel, TS)
-    samples = Record()
+    samples = RehearsalRecord()
     found: EvidenceView | None = None
 
     def hear(event: Event) -> None:
@@ -179,7 +179,7 @@ def rehearsed(case: Case) -> tuple[RehearsedJob, Record]:
     return job, samples
 
 
-def draw(path: Path, job: RehearsedJob, samples: Record) -> None:
+def draw(path: Path, job: RehearsedJob, samples: RehearsalRecord) -> None:
     record = stored_record(shown_samples(samples, None).columns())
     assert record is not None
     fast_job(path, job, record, "degC")

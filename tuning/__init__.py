@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from loopwright.tuning.analysis.margins import Margins, margins, ultimate_point
     from loopwright.tuning.analysis.step_figures import StepFigures
     from loopwright.tuning.analysis.step_response import Response, step_figures, step_response
-    from loopwright.tuning.fast.compared import Compared, ComparedGains, compare
+    from loopwright.tuning.fast.method_comparison import ComparedGains, MethodComparison, compare
     from loopwright.tuning.fast.tuned import METHODS, Tuned, tune
     from loopwright.tuning.gains import Gains, Parallel, Series, of_parallel, of_series, to_parallel, to_series
     from loopwright.tuning.identification.identify import Identified, identify
@@ -61,16 +61,16 @@ _WHERE = {
     "reduction.half_rule": ("half_rule",),
     "reduction.moments_and_areas": ("moments", "two_areas"),
     "rules.registry": ("Method",),
-    "fast.compared": ("Compared", "ComparedGains", "compare"),
+    "fast.method_comparison": ("MethodComparison", "ComparedGains", "compare"),
     "operation.recorded_operation": ("Observed", "observe"),
     "fast.tuned": ("METHODS", "Tuned", "tune"),
 }
 _HOME = {name: module for module, names in _WHERE.items() for name in names}
 
 __all__ = [
-    "FOPDT", "METHODS", "SOPDT", "Assessment", "Bode", "Compared", "ComparedGains", "Gains", "Identified",
-    "Integrating", "Margins", "Method", "Model", "Nyquist", "Observed", "Parallel", "Reason", "Refused", "Response",
-    "Series", "StepFigures", "TransferFunction", "Tuned", "as_model", "assess", "bode", "compare",
+    "FOPDT", "METHODS", "SOPDT", "Assessment", "Bode", "ComparedGains", "Gains", "Identified", "Integrating",
+    "Margins", "Method", "MethodComparison", "Model", "Nyquist", "Observed", "Parallel", "Reason", "Refused",
+    "Response", "Series", "StepFigures", "TransferFunction", "Tuned", "as_model", "assess", "bode", "compare",
     "fopdt_from_overshoot", "half_rule", "identify", "margins", "moments", "nyquist", "observe", "of_parallel",
     "of_series", "step_figures", "step_response", "to_parallel", "to_series", "tune", "two_areas", "ultimate_point",
 ]  # fmt: skip

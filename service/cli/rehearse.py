@@ -101,10 +101,12 @@ def rehearse(
 def _save_rehearsal(plot: Path, found: Rehearsal, method: str) -> None:
     from loopwright.service.cli.plots.job import NoPicture, job_picture
     from loopwright.service.cli.rehearsed import rehearsed_job, shown_samples
-    from loopwright.service.execution.rehearsed import Record
+    from loopwright.service.execution.rehearsed import RehearsalRecord
 
     try:
-        job_picture(plot, partial(shown_samples, found.record or Record()), rehearsed_job(found, method), "PV units")
+        job_picture(
+            plot, partial(shown_samples, found.record or RehearsalRecord()), rehearsed_job(found, method), "PV units"
+        )
     except NoPicture as error:
         print(f"loopwright: no plot: {error}", file=sys.stderr)
     except OSError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from loopwright.service.cli.plots.shown import ShownSamples
-from loopwright.service.execution.rehearsed import Record, Rehearsal
+from loopwright.service.execution.rehearsed import Rehearsal, RehearsalRecord
 from loopwright.service.results import (
     EvidenceView,
     FastResult,
@@ -18,7 +18,7 @@ from loopwright.service.states.job_state import JobState, state_after
 from loopwright.tuning.reasons import Reason
 
 
-def shown_samples(record: Record, stage: str | None) -> ShownSamples:
+def shown_samples(record: RehearsalRecord, stage: str | None) -> ShownSamples:
     """Returns the samples of one stage, or all for None, as columns."""
     pairs = zip(record.stages, record.samples, strict=True)
     of = [(name, each) for name, each in pairs if stage is None or name == stage]

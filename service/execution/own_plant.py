@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import loop_of, options_of, rehearsal_of
-from loopwright.service.execution.rehearsed import Record, Rehearsal
+from loopwright.service.execution.rehearsed import Rehearsal, RehearsalRecord
 from loopwright.service.inputs.plant_file import OwnPlant, PresentGains
 from loopwright.service.inputs.plausible import Implausible, check_sampling
 from loopwright.service.inputs.validation import lines
@@ -30,7 +30,7 @@ BUMP = 0.05
 """The move of MV that shows the gain, as a part of the room to its nearer limit."""
 
 
-class Plant(Protocol):
+class HasStep(Protocol):
     """A plant of one's own."""
 
     def step(self, mv: float, /) -> float:
@@ -39,7 +39,7 @@ class Plant(Protocol):
 
 
 def retune(
-    plant: Plant,
+    plant: HasStep,
     method: str = FAST,
     *,
     on_event: Callable[[Event], None] | None = None,
@@ -101,7 +101,7 @@ def retune(
         max_time_s=500 * facts.T95_s, max_frozen_s=3 * facts.T95_s, sp_deviation=facts.sp_deviation,
     )  # fmt: skip
     hooks = on_event or (lambda event: None), lambda samples: None
-    found = rehearsal_of(facts, asked, loop, limits, own, method, hooks, Record())
+    found = rehearsal_of(facts, asked, loop, limits, own, method, hooks, RehearsalRecord())
     if process.error is not None:
         raise process.error
     return found
@@ -113,7 +113,7 @@ class _Process:
     pv: the last PV.  setpoint: PV at rest.  error: what the plant has raised; the runner would take it for its own.
     """
 
-    def __init__(self, plant: Plant) -> None:
+    def __init__(self, plant: HasStep) -> None:
         kind = type(plant).__name__
         if isinstance(plant, type):
             raise TypeError(f"{plant.__name__} is a class: give an object of it, {plant.__name__}(...)")

@@ -17,7 +17,7 @@ from loopwright.controller.channel import Channel, RelaySettings, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant, SimulatedProcess
 from loopwright.service.execution.guard import RunLimits
-from loopwright.service.execution.rehearsed import Record, Rehearsal
+from loopwright.service.execution.rehearsed import Rehearsal, RehearsalRecord
 from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.inputs.plant_file import PlantFile, PresentGains, RehearsedPlant
@@ -216,7 +216,7 @@ def rehearse(
     asked: the options as one of these two; in place of the options by name.
     excitations: what fast may move the loop by; manual alone: the loop is in manual.
     """
-    record = None if on_samples else Record()
+    record = None if on_samples else RehearsalRecord()
     try:
         file = _complete(PlantFile.model_validate(spec))
         loop, facts = _loop(file, Mode.MANUAL if excitations == (Excitation.MANUAL,) else Mode.AUTOMATIC)
@@ -238,7 +238,7 @@ def rehearsal_of(
     plant: RehearsedPlant,
     method: str,
     hooks: tuple[Callable[[Event], None], Callable[[list[Sample]], None]] = (lambda event: None, lambda samples: None),
-    record: Record | None = None,
+    record: RehearsalRecord | None = None,
     model: Model | None = None,
     excitations: tuple[Excitation, ...] = (Excitation.RELAY,),
 ) -> Rehearsal:
@@ -376,7 +376,7 @@ def _ended(
     method: str,
     outcome: RunResult[Proposal] | RunResult[FastProposal],
     results: dict[str, object],
-    record: Record | None,
+    record: RehearsalRecord | None,
     anyway: bool,
 ) -> Rehearsal:
     """Returns how a run of the procedure ended.

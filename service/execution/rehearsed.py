@@ -25,7 +25,7 @@ Column = NDArray[np.float64]
 
 
 @dataclass(eq=False)
-class Record:
+class RehearsalRecord:
     """The samples of a rehearsal, as its events and samples come.
 
     stage: the stage that runs.  stages: the stage of each sample.  samples: the samples.
@@ -84,7 +84,7 @@ class Rehearsal:
     plant_time_s: dict[str, float] = field(default_factory=dict)
     stages: dict[str, object] = field(default_factory=dict)
     plant: RehearsedPlant | None = None
-    record: Record | None = None
+    record: RehearsalRecord | None = None
 
     @property
     def gains(self) -> Gains | None:

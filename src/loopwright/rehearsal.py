@@ -13,10 +13,10 @@ Rehearsal   the answer: gains, model, ended (why there are none), result (every 
 The controller, the procedures and the runner are those of the service, and time is counted in samples.
 """
 
-from loopwright.service.execution.own_plant import Plant, retune
+from loopwright.service.execution.own_plant import HasStep, retune
 from loopwright.service.execution.rehearsal import rehearse
-from loopwright.service.execution.rehearsed import Record, Rehearsal
+from loopwright.service.execution.rehearsed import Rehearsal, RehearsalRecord
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Refused
 
-__all__ = ["Gains", "Plant", "Record", "Refused", "Rehearsal", "rehearse", "retune"]
+__all__ = ["Gains", "HasStep", "Refused", "Rehearsal", "RehearsalRecord", "rehearse", "retune"]

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.refusals import cases, draw, rehearsed
 from loopwright.service.cli.rehearsed import RehearsedJob, shown_samples
-from loopwright.service.execution.rehearsed import Record
+from loopwright.service.execution.rehearsed import RehearsalRecord
 from loopwright.service.jobs.stored_record import stored_record
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.record_evaluation import evaluate_again
@@ -20,7 +20,7 @@ WITH_FIT = {"unexplained", "disturbed", "uncertain", "model_mismatch", "controll
 
 
 @cache
-def job_of(reason: str) -> tuple[RehearsedJob, Record]:
+def job_of(reason: str) -> tuple[RehearsedJob, RehearsalRecord]:
     return rehearsed(cases()[reason])
 
 

@@ -60,7 +60,7 @@ class ComparedGains:
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Compared:
+class MethodComparison:
     """The comparison of several gains on one model. `pandas.DataFrame(compared.rows)` is the same as a data frame.
 
     model: the model.
@@ -119,7 +119,7 @@ class Compared:
 
 def compare(
     model: AnyModel, given: Iterable[str] | Mapping[str, str | AnyGains] | None = None, dead_time_s: float = 0.0
-) -> Compared:
+) -> MethodComparison:
     """Compares methods, or gains with names, on one model.
 
     model, dead_time_s: as of `tune`.
@@ -141,7 +141,7 @@ def compare(
             method_of(each)
         else:
             as_gains(each)
-    return Compared(plant, tuple(_row(str(name), plant, each) for name, each in named.items()))
+    return MethodComparison(plant, tuple(_row(str(name), plant, each) for name, each in named.items()))
 
 
 def _row(name: str, model: Model, given: str | AnyGains) -> ComparedGains:
