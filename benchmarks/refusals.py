@@ -18,9 +18,10 @@ from benchmarks.other_controllers import Other, OtherChannel
 from loopwright.controller.channel import Channel, Settings
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.cli.plots.fast_job import fast_job
-from loopwright.service.cli.rehearsed import RehearsedJob, RehearsedSamples
+from loopwright.service.cli.rehearsed import RehearsedJob, shown_samples
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop, _parameters
+from loopwright.service.execution.rehearsed import RehearsalRecord
 from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import run
 from loopwright.service.jobs.stored_record import stored_record
@@ -138,7 +139,7 @@ def cases() -> dict[str, Case]:
     }  # fmt: skip
 
 
-def rehearsed(case: Case) -> tuple[RehearsedJob, RehearsedSamples]:
+def rehearsed(case: Case) -> tuple[RehearsedJob, RehearsalRecord]:
     """The job, as GET /jobs/{id} would show it, and its samples."""
     plant = Odd(case)
     settings = Settings(mv_low=0.0, mv_high=100.0, safe_output=MIDDLE, pv_low=-1e9, pv_high=1e9, reverse=case.reverse)
@@ -146,7 +147,7 @@ def rehearsed(case: Case) -> tuple[RehearsedJob, RehearsedSamples]:
     start = (TS, settings, _parameters(case.gains), SP, int(mode), MIDDLE)
     channel = Channel(*start) if case.other is None else OtherChannel(case.other, PERIOD_S, *start)
     loop = RehearsedLoop(plant, channel, TS)
-    samples = RehearsedSamples()
+    samples = RehearsalRecord()
     found: EvidenceView | None = None
 
     def hear(event: Event) -> None:
@@ -178,8 +179,8 @@ def rehearsed(case: Case) -> tuple[RehearsedJob, RehearsedSamples]:
     return job, samples
 
 
-def draw(path: Path, job: RehearsedJob, samples: RehearsedSamples) -> None:
-    record = stored_record(samples.columns(None).columns())
+def draw(path: Path, job: RehearsedJob, samples: RehearsalRecord) -> None:
+    record = stored_record(shown_samples(samples, None).columns())
     assert record is not None
     fast_job(path, job, record, "degC")
     Image.open(path).convert("RGB").quantize(COLOURS).save(path, optimize=True)

@@ -8,12 +8,15 @@
     found.plot().savefig("simc.png")                # a notebook shows it by itself
 
 Models        FOPDT, SOPDT, Integrating, TransferFunction, as_model (from control, scipy.signal, or names: {"K": ...})
-Tuning        tune (by a rule, or as fast designs: "fast", ms=1.6), METHODS (every rule: what it is for, its source,
-              its options), Tuned, Gains
-Analysis      margins (Ms, gain, phase and delay margin), delay_margin_s, ultimate_point, assess,
-              step_response, step_figures
+              Whatever takes a model takes each of these, and a result that has one (identify, observe, tune); whatever
+              takes gains takes a result that has some.
+Tuning        tune (by a rule, or as the procedure fast designs: "fast", Ms=1.6), METHODS (every method: what it is
+              for, its source, its options), Tuned, Gains
+              compare (methods, or gains with names, in one table)
+Analysis      margins (Ms, gain, phase and delay margin), bode, nyquist, ultimate_point, assess, step_response,
+              step_figures
 Reduction     half_rule, moments, two_areas
-From a record identify, fopdt_from_overshoot
+From a record identify (a test), observe (a loop in automatic: model and gains), fopdt_from_overshoot
 Other forms   to_parallel, of_parallel, to_series, of_series
 Errors        Refused (with a Reason, and what to do about it)
 
@@ -28,22 +31,26 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from loopwright.tuning.analysis.assessment import Assessment, assess
-    from loopwright.tuning.analysis.margins import Margins, delay_margin_s, margins, ultimate_point
+    from loopwright.tuning.analysis.frequency_response import Bode, Nyquist, bode, nyquist
+    from loopwright.tuning.analysis.margins import Margins, margins, ultimate_point
     from loopwright.tuning.analysis.step_figures import StepFigures
     from loopwright.tuning.analysis.step_response import Response, step_figures, step_response
-    from loopwright.tuning.fast.tuned import Tuned, tune
+    from loopwright.tuning.fast.method_comparison import ComparedGains, MethodComparison, compare
+    from loopwright.tuning.fast.tuned import METHODS, Tuned, tune
     from loopwright.tuning.gains import Gains, Parallel, Series, of_parallel, of_series, to_parallel, to_series
     from loopwright.tuning.identification.identify import Identified, identify
     from loopwright.tuning.identification.overshoot import fopdt_from_overshoot
     from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction, as_model
+    from loopwright.tuning.operation.recorded_operation import Observed, observe
     from loopwright.tuning.reasons import Reason, Refused
     from loopwright.tuning.reduction.half_rule import half_rule
     from loopwright.tuning.reduction.moments_and_areas import moments, two_areas
-    from loopwright.tuning.rules.registry import METHODS, Method
+    from loopwright.tuning.rules.registry import Method
 
 _WHERE = {
     "analysis.assessment": ("Assessment", "assess"),
-    "analysis.margins": ("Margins", "delay_margin_s", "margins", "ultimate_point"),
+    "analysis.frequency_response": ("Bode", "Nyquist", "bode", "nyquist"),
+    "analysis.margins": ("Margins", "margins", "ultimate_point"),
     "analysis.step_figures": ("StepFigures",),
     "analysis.step_response": ("Response", "step_figures", "step_response"),
     "gains": ("Gains", "Parallel", "Series", "of_parallel", "of_series", "to_parallel", "to_series"),
@@ -53,15 +60,18 @@ _WHERE = {
     "reasons": ("Reason", "Refused"),
     "reduction.half_rule": ("half_rule",),
     "reduction.moments_and_areas": ("moments", "two_areas"),
-    "rules.registry": ("METHODS", "Method"),
-    "fast.tuned": ("Tuned", "tune"),
+    "rules.registry": ("Method",),
+    "fast.method_comparison": ("MethodComparison", "ComparedGains", "compare"),
+    "operation.recorded_operation": ("Observed", "observe"),
+    "fast.tuned": ("METHODS", "Tuned", "tune"),
 }
 _HOME = {name: module for module, names in _WHERE.items() for name in names}
 
 __all__ = [
-    "FOPDT", "METHODS", "SOPDT", "Assessment", "Gains", "Identified", "Integrating", "Margins", "Method", "Model",
-    "Parallel", "Reason", "Refused", "Response", "Series", "StepFigures", "TransferFunction", "Tuned", "as_model",
-    "assess", "delay_margin_s", "fopdt_from_overshoot", "half_rule", "identify", "margins", "moments", "of_parallel",
+    "FOPDT", "METHODS", "SOPDT", "Assessment", "Bode", "ComparedGains", "Gains", "Identified", "Integrating",
+    "Margins", "Method", "MethodComparison", "Model", "Nyquist", "Observed", "Parallel", "Reason", "Refused",
+    "Response", "Series", "StepFigures", "TransferFunction", "Tuned", "as_model", "assess", "bode", "compare",
+    "fopdt_from_overshoot", "half_rule", "identify", "margins", "moments", "nyquist", "observe", "of_parallel",
     "of_series", "step_figures", "step_response", "to_parallel", "to_series", "tune", "two_areas", "ultimate_point",
 ]  # fmt: skip
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from numbers import Real
+from typing import Protocol
 
 from loopwright.tuning.reasons import Reason, Refused
 
@@ -48,6 +49,28 @@ class Gains:
         weights = [f"{name} {value:.6g}" for name, value, without in usual if value != without]
         integral = f"Ti {self.Ti:.6g} s" if self.Ti else "no Ti"
         return ", ".join([f"Kp {self.Kp:.6g}", integral, *times, *weights])
+
+
+class WithGains(Protocol):
+    """What has been found with gains, such as the result of `tune`; None where none were found."""
+
+    @property
+    def gains(self) -> Gains | None: ...
+
+
+AnyGains = Gains | WithGains
+"""What `as_gains` takes."""
+
+
+def as_gains(given: AnyGains) -> Gains:
+    """The gains, or those of a result that has some. Raises TypeError for what has none."""
+    if isinstance(given, Gains):
+        return given
+    if isinstance(found := getattr(given, "gains", None), Gains):
+        return found
+    if hasattr(given, "gains"):
+        raise TypeError(f"this {type(given).__name__} has no gains: {given!r}")
+    raise TypeError(f"{type(given).__name__} has no gains: give Gains(Kp=..., Ti=...), or a result of tune")
 
 
 @dataclass(frozen=True, slots=True)

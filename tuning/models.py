@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, Protocol
 
 import numpy as np
@@ -32,8 +33,7 @@ class FOPDT:
     L: float
 
     def __post_init__(self) -> None:
-        if not (np.isfinite([self.K, self.T, self.L]).all() and self.K != 0.0 and self.T > 0.0 and self.L >= 0.0):
-            raise ValueError(f"not a model: K={self.K}, T={self.T} s, L={self.L} s")
+        _check(self.K, positive={"T": self.T}, not_negative={"L": self.L})
 
     @property
     def num(self) -> tuple[float, ...]:
@@ -80,8 +80,7 @@ class SOPDT:
         T2: float | None = None,
     ) -> None:
         if T1 is not None and T2 is not None and T is None and zeta is None:
-            if not (T1 > 0.0 and T2 > 0.0):
-                raise ValueError(f"time constants must be positive: T1={T1} s, T2={T2} s")
+            _check(K, positive={"T1": T1, "T2": T2})
             T = math.sqrt(T1 * T2)
             zeta = (T1 + T2) / (2.0 * T)
         elif T1 is not None or T2 is not None:
@@ -90,14 +89,12 @@ class SOPDT:
             raise TypeError("SOPDT takes K, T, zeta, L or K, T1, T2, L, all four of them")
         for name, value in (("K", K), ("T", T), ("zeta", zeta), ("L", L)):
             object.__setattr__(self, name, value)
-        finite = bool(np.isfinite([self.K, self.T, self.zeta, self.L]).all())
-        if not (finite and self.K != 0.0 and self.T > 0.0 and self.zeta > 0.0 and self.L >= 0.0):
-            raise ValueError(f"not a model: K={self.K}, T={self.T} s, zeta={self.zeta}, L={self.L} s")
+        _check(self.K, positive={"T": self.T, "zeta": self.zeta}, not_negative={"L": self.L})
 
-    @classmethod
-    def of_time_constants(cls, K: float, T1: float, T2: float, L: float) -> SOPDT:
-        """The model K*exp(-L*s)/((T1*s + 1)(T2*s + 1)) with positive time constants T1 and T2, s."""
-        return cls(K, L=L, T1=T1, T2=T2)
+    def __repr__(self) -> str:
+        """The model by its two lags where it has them."""
+        named = {"T": self.T, "zeta": self.zeta} if math.isnan(self.T1) else {"T1": self.T1, "T2": self.T2}
+        return f"SOPDT({', '.join(f'{n}={v:.10g}' for n, v in {'K': self.K, **named, 'L': self.L}.items())})"
 
     @property
     def T1(self) -> float:
@@ -147,8 +144,7 @@ class Integrating:
     T: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite([self.K, self.T, self.L]).all() and self.K != 0.0 and self.T >= 0.0 and self.L >= 0.0):
-            raise ValueError(f"not a model: K={self.K} per s, T={self.T} s, L={self.L} s")
+        _check(self.K, not_negative={"T": self.T, "L": self.L})
 
     @property
     def num(self) -> tuple[float, ...]:
@@ -182,13 +178,13 @@ class TransferFunction:
 
     def __post_init__(self) -> None:
         for name in ("num", "den"):
-            kept = np.trim_zeros(np.asarray(getattr(self, name), dtype=float), "f")
+            kept = np.trim_zeros(_coefficients(name, getattr(self, name)), "f")
             object.__setattr__(self, name, tuple(float(c) for c in kept))
         if not self.num or len(self.den) < 2 or len(self.num) > len(self.den):
             raise ValueError("a transfer function needs a pole and a numerator no longer than its denominator")
-        finite = bool(np.isfinite([*self.num, *self.den, self.L]).all())
-        if not (finite and self.num[-1] and (self.den[-1] or self.den[-2]) and self.L >= 0.0):
-            raise ValueError("coefficients must be finite, num[-1] not 0, at most one pole at 0, the dead time >= 0")
+        if not (self.num[-1] and (self.den[-1] or self.den[-2])):
+            raise ValueError("num must end with a coefficient other than 0, and den may have one pole at 0 at most")
+        _check(1.0, not_negative={"L": self.L})
 
     @property
     def static_gain(self) -> float:
@@ -240,10 +236,10 @@ class LinearSystem(Protocol):
 
 
 class WithModel(Protocol):
-    """What has been found with a model, such as the result of `identify`."""
+    """What has been found with a model, such as the result of `identify`; None where none was found."""
 
     @property
-    def model(self) -> Model: ...
+    def model(self) -> Model | None: ...
 
 
 AnyModel = Model | LinearSystem | WithModel | tuple[ArrayLike, ArrayLike] | Mapping[str, Any]
@@ -260,10 +256,14 @@ def as_model(system: AnyModel, dead_time_s: float = 0.0) -> Model:
     Raises TypeError for what is no model. Raises ValueError for more than one input or output, discrete time, a dead
     time given twice, and coefficients that make no model.
     """
+    if isinstance(system, Model) and not dead_time_s:
+        return system
     if isinstance(system, Mapping):
         system = _by_names(system)
     elif isinstance(found := getattr(system, "model", None), Model):
         system = found
+    elif found is None and hasattr(system, "model"):
+        raise TypeError(f"this {type(system).__name__} has no model: {system!r}")
     if isinstance(system, Model):
         if dead_time_s:
             raise ValueError(
@@ -271,14 +271,17 @@ def as_model(system: AnyModel, dead_time_s: float = 0.0) -> Model:
             )
         return system
     if isinstance(system, tuple) and len(system) == 2:
-        num, den = (np.atleast_1d(np.asarray(each, dtype=float)).tolist() for each in system)
-        return TransferFunction(tuple(num), tuple(den), dead_time_s)
+        num, den = (_coefficients(name, each) for name, each in zip(("num", "den"), system, strict=True))
+        return TransferFunction(tuple(num.tolist()), tuple(den.tolist()), dead_time_s)
     return _of_another_library(system, dead_time_s)
 
 
 def _by_names(given: Mapping[str, Any]) -> Model:
     """The model whose quantities have these names; raises as `as_model`."""
+    fraction = "num" in given or "den" in given
     named = {str(name).removesuffix("_s"): value for name, value in given.items()}
+    if fraction and "L" in named:
+        named["dead_time"] = named.pop("L")
     names, integrating = named.keys() - {"integrating"}, named.pop("integrating", False)
     if integrating is True and {"K", "L"} <= names <= {"K", "L", "T"}:
         return Integrating(**named)
@@ -287,11 +290,42 @@ def _by_names(given: Mapping[str, Any]) -> Model:
     if integrating is False and names in ({"K", "T", "zeta", "L"}, {"K", "T1", "T2", "L"}):
         return SOPDT(**named)
     if integrating is False and {"num", "den"} <= names <= {"num", "den", "dead_time"}:
-        return TransferFunction(tuple(named["num"]), tuple(named["den"]), named.get("dead_time", 0.0))
+        return TransferFunction(named["num"], named["den"], named.get("dead_time", 0.0))
     raise TypeError(
         f"{', '.join(map(str, given))}: no model has these quantities; give K, T, L; K, T1, T2, L; K, T, zeta, L; K, "
         "L, integrating, and T where it has a lag; or num, den, dead_time_s"
     )
+
+
+def _check(K: object, positive: Mapping[str, Any] | None = None, not_negative: Mapping[str, Any] | None = None) -> None:
+    """Raises TypeError for what is no number, ValueError for one that makes no model."""
+    positive, not_negative = positive or {}, not_negative or {}
+    for name, value in {"K": K, **positive, **not_negative}.items():
+        if type(value) is not float and (isinstance(value, bool) or not isinstance(value, Real)):
+            raise TypeError(f"{name} must be a number, not {value!r}")
+    for name, value in (("K", K), *positive.items(), *not_negative.items()):
+        unit = "" if name == "zeta" else " s"
+        if not math.isfinite(value):
+            raise ValueError(f"{name} must be a finite number, not {value}")
+        if name == "K" and value == 0.0:
+            raise ValueError("K must not be 0: PV would not answer MV")
+        if name in positive and value <= 0.0:
+            raise ValueError(f"{name} must be more than 0{unit}, not {value:g}")
+        if name in not_negative and value < 0.0:
+            raise ValueError(f"{name} must be 0{unit} or more, not {value:g}")
+
+
+def _coefficients(name: str, given: object) -> Reals:
+    """The coefficients as an array. Raises TypeError for what are no numbers, ValueError for one that is not finite."""
+    try:
+        found = np.atleast_1d(np.asarray(given))
+    except ValueError:
+        found = np.empty((0, 0))
+    if found.ndim != 1 or found.dtype.kind not in "iuf":
+        raise TypeError(f"{name} must be coefficients from the highest power of s down, such as (10, 1), not {given!r}")
+    if not np.isfinite(found).all():
+        raise ValueError(f"{name} must have finite coefficients, not {given!r}")
+    return np.asarray(found, dtype=float)
 
 
 def _of_another_library(given: Any, dead_time_s: float) -> TransferFunction:

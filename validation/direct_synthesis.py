@@ -139,7 +139,7 @@ def _underdamped(references: References) -> Table:
 
 
 def _equations(references: References) -> Table:
-    model = SOPDT.of_time_constants(1.0, 2.0, 1.0, 1.0)
+    model = SOPDT(K=1.0, T1=2.0, T2=1.0, L=1.0)
 
     def stable_to(high: float) -> float:
         low = 0.1

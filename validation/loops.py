@@ -24,7 +24,7 @@ def plant(entry: dict[str, Any]) -> TransferFunction:
 def sopdt(references: References, name: str) -> SOPDT:
     """An object of the direct-synthesis paper."""
     o = references.rules["direct_synthesis"]["objects"][name]
-    return SOPDT.of_time_constants(o["K"], o["T1"], o["T2"], o["L"])
+    return SOPDT(K=o["K"], T1=o["T1"], T2=o["T2"], L=o["L"])
 
 
 def moments(references: References, name: str) -> FOPDT:

@@ -52,7 +52,7 @@ class TuningRequest(BaseModel):
     model: ModelForm = Field(
         description="Process model in one of five forms", examples=[{"K": 0.8, "T_s": 3.0, "L_s": 1.0}]
     )
-    method: str = Field(default="all", description="A method of GET /methods, or all", examples=["simc"])
+    method: str = Field(default="all", description="A method of GET /methods, fast, or all", examples=["simc"])
     options: Mapping[str, object] = Field(
         default_factory=dict,
         description="Options of the method by name; with all, each option goes to the methods that have it",

@@ -25,6 +25,7 @@ from loopwright.service.results import DESIGNED
 from loopwright.tuning.fast.design import Aim
 from loopwright.tuning.fast.options import weights_up_to
 from loopwright.tuning.fast.procedure import FAST
+from loopwright.tuning.rules.registry import METHODS
 
 
 def router(jobs: Jobs, pool: Pool) -> APIRouter:
@@ -35,7 +36,7 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
         "/methods", tags=["tunings"], summary="The tuning methods", responses={**LINK, **problems.responses(422)}
     )
     def list_methods(response: Response, limit: Limit = 1000, cursor: Position = None) -> list[MethodView]:
-        found = [MethodView.model_validate(each) for each in tunings.methods_json()]
+        found = [MethodView.model_validate(each) for each in tunings.methods_json(METHODS)]
         return list(page_of(response, "/methods", found, limit, cursor))
 
     @routes.post(

@@ -19,7 +19,7 @@ from loopwright.service.cli.terminal import cell, figure
 from loopwright.service.states.job_state import JobState
 
 if TYPE_CHECKING:
-    from loopwright.service.execution.rehearsal import Rehearsal
+    from loopwright.service.execution.rehearsed import Rehearsal
 
 
 def follow(client: Client, job_url: str, to: Console | None = None) -> JobView:

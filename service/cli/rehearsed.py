@@ -1,12 +1,11 @@
-"""The samples of a rehearsal by stages, and the rehearsal as a plot takes a job."""
+"""A rehearsal and its samples as a plot takes those of a job."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from loopwright.service.cli.plots.shown import ShownSamples
-from loopwright.service.execution.rehearsal import Rehearsal
+from loopwright.service.execution.rehearsed import Rehearsal, RehearsalRecord
 from loopwright.service.results import (
     EvidenceView,
     FastResult,
@@ -16,40 +15,21 @@ from loopwright.service.results import (
     VerificationView,
 )
 from loopwright.service.states.job_state import JobState, state_after
-from loopwright.tuning.plan import Event, Sample, StageStarted
 from loopwright.tuning.reasons import Reason
 
 
-@dataclass
-class RehearsedSamples:
-    """The samples of a rehearsal, as its events and samples come."""
-
-    stage: str = "preflight"
-    stages: list[str] = field(default_factory=list)
-    samples: list[Sample] = field(default_factory=list)
-
-    def on_event(self, event: Event) -> None:
-        """Notes the stage that begins; the samples of a stage that is done have come before."""
-        if isinstance(event, StageStarted):
-            self.stage = event.stage
-
-    def on_samples(self, samples: Sequence[Sample]) -> None:
-        """Takes samples of the present stage."""
-        self.stages += [self.stage] * len(samples)
-        self.samples += samples
-
-    def columns(self, stage: str | None) -> ShownSamples:
-        """Returns the samples of one stage, or all for None, as columns."""
-        pairs = zip(self.stages, self.samples, strict=True)
-        of = [(name, each) for name, each in pairs if stage is None or name == stage]
-        return ShownSamples(
-            stage=[name for name, _ in of],
-            t_s=[each.t for _, each in of],
-            sp=[each.sp for _, each in of],
-            pv=[each.pv for _, each in of],
-            mv=[each.mv for _, each in of],
-            mode=[int(each.mode) for _, each in of],
-        )
+def shown_samples(record: RehearsalRecord, stage: str | None) -> ShownSamples:
+    """Returns the samples of one stage, or all for None, as columns."""
+    pairs = zip(record.stages, record.samples, strict=True)
+    of = [(name, each) for name, each in pairs if stage is None or name == stage]
+    return ShownSamples(
+        stage=[name for name, _ in of],
+        t_s=[each.t for _, each in of],
+        sp=[each.sp for _, each in of],
+        pv=[each.pv for _, each in of],
+        mv=[each.mv for _, each in of],
+        mode=[int(each.mode) for _, each in of],
+    )
 
 
 @dataclass

@@ -7,44 +7,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Annotated, Any
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ValidationError
 
 from loopwright.controller.channel import Channel, RelaySettings, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant, SimulatedProcess
 from loopwright.service.execution.guard import RunLimits
+from loopwright.service.execution.rehearsed import Rehearsal, RehearsalRecord
 from loopwright.service.execution.result import result_of
 from loopwright.service.execution.runner import RunResult, run
-from loopwright.service.inputs.model_json import named, parse_model
-from loopwright.service.inputs.plausible import (
-    Finite,
-    Gain,
-    Implausible,
-    Size,
-    Time,
-    TimeOrNone,
-    Value,
-    check_model,
-    check_sampling,
-)
-from loopwright.service.inputs.validation import lines
-from loopwright.service.jsonable import to_jsonable
+from loopwright.service.inputs.plant_file import PlantFile, PresentGains, RehearsedPlant
+from loopwright.service.inputs.plausible import Implausible, check_sampling
+from loopwright.service.inputs.validation import did_you_mean, lines
 from loopwright.service.loops.loop import Restored
-from loopwright.service.results import FastResult, FiveStageResult, UltimateView, empty_result
+from loopwright.service.results import UltimateView, empty_result
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.analysis.margins import ultimate_point
-from loopwright.tuning.experiments.primitives import Directions
+from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.design_trial import trial
 from loopwright.tuning.fast.excitation_choice import chosen_stages, fast_by
 from loopwright.tuning.fast.options import DesignOptions
 from loopwright.tuning.fast.procedure import FAST, FastOptions, FastProposal
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.setpoint_procedure import SETPOINT, setpoint
-from loopwright.tuning.five_stage.procedure import STAGES, Facts, Options, Proposal, five_stage
+from loopwright.tuning.five_stage.procedure import PROCEDURE, STAGES, Options, Proposal, five_stage
 from loopwright.tuning.five_stage.ultimate_gain import UltimateResult
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, Model, TransferFunction
@@ -62,7 +52,8 @@ from loopwright.tuning.plan import (
     SetSetpoint,
     StageDone,
 )
-from loopwright.tuning.reasons import Ended, Failed, NoGain, Reason, Refused
+from loopwright.tuning.reasons import Ended, NoGain, Reason, Refused
+from loopwright.tuning.rules.registry import METHODS
 
 
 class RehearsedLoop:
@@ -157,105 +148,6 @@ def _gains(p: Parameters) -> Gains:
     return Gains(p.Kp, p.Ti, p.Td, p.Tf, p.b, p.c)
 
 
-class PresentGains(BaseModel):
-    """The gains of the loop before the test, in ISA form."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-    Kp: Gain
-    Ti: TimeOrNone = Field(default=0.0, description="s; 0: no integral part")
-    Td: TimeOrNone = Field(default=0.0, description="s")
-    Tf: TimeOrNone = Field(default=0.0, description="s, filter of the derivative")
-    b: Finite = Field(default=1.0, description="set-point weight of the proportional path")
-    c: Finite = Field(default=0.0, description="set-point weight of the derivative path")
-
-
-class PlantFile(BaseModel):
-    """A plant for `loopwright rehearse`, in deviation variables; what is left out is chosen and echoed."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-    name: str = "plant"
-    num: list[float] = Field(min_length=1, max_length=12, description="numerator, highest power of s first")
-    den: list[float] = Field(min_length=1, max_length=12, description="denominator, highest power of s first")
-    dead_time_s: float = Field(0.0, ge=0)
-    sample_time_s: Time | None = None
-    t95_s: Time | None = None
-    noise_std: Size = Field(0.0, description="standard deviation of the measurement, PV units")
-    seed: int = Field(1, ge=0)
-    mv_limits: tuple[Value, Value] = (-0.5, 0.5)
-    mv_step_max: Annotated[Value, Field(gt=0)] | None = Field(None, description="largest jump of MV in the test")
-    directions: Directions = Field(Directions.BOTH, description="to which sides of its rest the set-point is moved")
-    sp_rate_max_per_s: Annotated[Value, Field(gt=0)] | None = Field(
-        None, description="largest rate of the set-point in the test, PV units per s"
-    )
-    sp_deviation: Annotated[Value, Field(gt=0)] | None = None
-    gains: PresentGains | None = Field(None, description="present gains of the loop")
-    reverse_acting: bool | None = Field(None, description="the controller's action; left out: right for the plant")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _any_form(cls, data: object) -> object:
-        """Takes a model in any form, such as K, T_s, L_s, in place of num, den and dead_time_s."""
-        if isinstance(data, str):
-            data = named(data)
-        if not isinstance(data, Mapping) or "num" in data or "den" in data:
-            return data
-        form = {name: value for name, value in data.items() if name not in cls.model_fields}
-        if not form:
-            return data
-        model = parse_model(form)
-        polynomials = {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
-        return {name: value for name, value in data.items() if name not in form} | polynomials
-
-    @model_validator(mode="after")
-    def _proper(self) -> PlantFile:
-        if not any(self.den) or self.den[0] == 0:
-            raise ValueError("den must start with a coefficient other than 0")
-        if len(self.num) > len(self.den):
-            raise ValueError(f"num has order {len(self.num) - 1}, more than den's {len(self.den) - 1}: not proper")
-        if not any(self.num):
-            raise ValueError("num is zero: the plant does not answer MV")
-        if self.num[-1] == 0 and self.den[-1] != 0:
-            raise ValueError("num must end with a coefficient other than 0: PV would come back from every move of MV")
-        if not self.mv_limits[0] < 0 < self.mv_limits[1]:
-            raise ValueError(f"mv_limits must be [low < 0, high > 0] around the operating point, not {self.mv_limits}")
-        check_model(self.num, self.den, self.dead_time_s)
-        return self
-
-
-@dataclass(frozen=True)
-class Rehearsal:
-    """How a rehearsal ended.
-
-    result: as far as it came.  ended: why there is no proposal, None where there is one.
-    plant_time_s: the plant time of each stage, s.  stages: what each stage found.
-    plant: the plant as completed, None for one that cannot be used, or is a process of one's own.
-    """
-
-    result: FastResult | FiveStageResult
-    ended: Ended | None
-    plant_time_s: dict[str, float] = field(default_factory=dict)
-    stages: dict[str, object] = field(default_factory=dict)
-    plant: PlantFile | None = None
-
-    def as_json(self) -> dict[str, object]:
-        """The object of `loopwright rehearse --json`: the result under the names of `GET /jobs/{id}`, and how it came
-        about. What is not known is null."""
-        ended = self.ended
-        return {
-            "name": None if self.plant is None else self.plant.name,
-            "outcome": _outcome(ended),
-            "reason": ended.reason.value if ended else None,
-            "detail": ended.detail if ended else None,
-            "advice": ended.advice if ended else None,
-            **self.result.model_dump(mode="json"),
-            "plant_time_s": {**self.plant_time_s, "total": sum(self.plant_time_s.values())},
-            "stages": to_jsonable(self.stages),
-            "input": None if self.plant is None else self.plant.model_dump(mode="json"),
-        }
-
-
 def _nice(x: float) -> float:
     """Returns the largest 1, 2 or 5 times a power of ten that is not above x."""
     power = 10.0 ** math.floor(math.log10(x))
@@ -324,82 +216,57 @@ def rehearse(
     asked: the options as one of these two; in place of the options by name.
     excitations: what fast may move the loop by; manual alone: the loop is in manual.
     """
-    results: dict[str, object] = {}
-
-    def listen(event: Event) -> None:
-        if isinstance(event, StageDone):
-            results[event.stage] = event.result
-        if on_event:
-            on_event(event)
-
+    record = None if on_samples else RehearsalRecord()
     try:
         file = _complete(PlantFile.model_validate(spec))
         loop, facts = _loop(file, Mode.MANUAL if excitations == (Excitation.MANUAL,) else Mode.AUTOMATIC)
-        limits = _limits(facts, _reach(file))
-        hear = on_samples or (lambda samples: None)
-        asked = asked or _asked(method, model, options)
-        outcome = _carried_out(facts, asked, model, excitations, loop, limits, listen, hear)
+        asked = asked or options_of(method, model, options)
     except ValidationError as error:
         return Rehearsal(empty_result(method), Refused(Reason.BAD_INPUT, lines(error)))
     except Ended as ended:
         return Rehearsal(empty_result(method), ended)
-    return _rehearsal(file, method, outcome, results, anyway=asked.propose_anyway)
+    limits = _limits(facts, _reach(file))
+    hooks = on_event or (lambda event: None), on_samples or (lambda samples: None)
+    return rehearsal_of(facts, asked, loop, limits, file, method, hooks, record, model, excitations)
 
 
-class _OwnProcess:
-    """A process that is a function of its user, from MV over one sampling period to PV at its end."""
-
-    def __init__(self, step: Callable[[float], float], pv: float) -> None:
-        self._step = step
-        self.pv = pv
-
-    def step(self, mv: float) -> float:
-        self.pv = float(self._step(mv))
-        return self.pv
-
-
-def rehearse_process(
-    step: Callable[[float], float],
-    *,
-    pv: float,
-    mv: float,
-    sample_time_s: float,
-    t95_s: float,
-    sp_deviation: float,
-    gains: Gains,
-    reverse_acting: bool = True,
-    mv_limits: tuple[float, float] = (0.0, 100.0),
-    pv_limits: tuple[float, float] = (-math.inf, math.inf),
-    method: str = FAST,
-    **options: Any,
+def rehearsal_of(
+    facts: Facts,
+    asked: DesignOptions | Options,
+    loop: RehearsedLoop,
+    limits: RunLimits,
+    plant: RehearsedPlant,
+    method: str,
+    hooks: tuple[Callable[[Event], None], Callable[[list[Sample]], None]] = (lambda event: None, lambda samples: None),
+    record: RehearsalRecord | None = None,
+    model: Model | None = None,
+    excitations: tuple[Excitation, ...] = (Excitation.RELAY,),
 ) -> Rehearsal:
-    """Runs a procedure on a process of one's own, sample by sample in memory, from rest in automatic.
+    """Runs the procedure on a loop in memory.
 
-    step: takes the MV of one sampling period, returns the PV at its end.
-    pv, mv: where it rests; pv is the set-point.  gains: those in effect.
-    sample_time_s, t95_s: s.  sp_deviation, pv_limits: PV units.  mv_limits: MV units.
-    reverse_acting: whether MV falls as PV rises, as it must where PV rises with MV.
-    method, options: as of `rehearse`.
+    plant: what the loop is, to be echoed. hooks: receive events and samples. record: takes them, too.
+    model, excitations: as of `rehearse`.
     """
     results: dict[str, object] = {}
+    on_event, on_samples = hooks
 
     def listen(event: Event) -> None:
         if isinstance(event, StageDone):
             results[event.stage] = event.result
+        if record is not None:
+            record.on_event(event)
+        on_event(event)
 
-    (low, high), (pv_low, pv_high), span = mv_limits, pv_limits, 1e9
-    settings = Settings(mv_low=low, mv_high=high, safe_output=mv, pv_low=-span, pv_high=span, reverse=reverse_acting)
-    channel = Channel(sample_time_s, settings, _parameters(gains), pv, int(Mode.AUTOMATIC), mv)
-    facts = Facts(sample_time_s, t95_s, low, high, sp_deviation, gains, reverse_acting)
-    far = (pv_low, pv_high, low, high)
-    limits = RunLimits(*far, max_time_s=500 * t95_s, max_frozen_s=3 * t95_s, sp_deviation=sp_deviation)
-    loop = RehearsedLoop(_OwnProcess(step, pv), channel, sample_time_s)
+    def hear(samples: list[Sample]) -> None:
+        if record is not None:
+            record.on_samples(samples)
+        on_samples(samples)
+
     try:
-        asked = _asked(method, None, options)
-        outcome = _carried_out(facts, asked, None, (Excitation.RELAY,), loop, limits, listen, lambda samples: None)
+        outcome = _carried_out(facts, asked, model, excitations, loop, limits, listen, hear)
     except Ended as ended:
         return Rehearsal(empty_result(method), ended)
-    return _rehearsal(None, method, outcome, results, anyway=asked.propose_anyway)
+    return _ended(plant, method, outcome, results, record, asked.propose_anyway)
 
 
 def _carried_out(
@@ -426,13 +293,22 @@ def _designing(
     return fast_by(excitations, facts, asked) if model is None else trial(facts, asked, model)
 
 
-def _asked(method: str, model: Model | None, options: dict[str, Any]) -> DesignOptions | Options:
-    """Raises Refused."""
-    if method == FAST:
-        return FastOptions(**{"Ms" if name == "ms" else name: value for name, value in options.items()})
-    if method == SETPOINT:
-        return DesignOptions(**{"Ms" if name == "ms" else name: value for name, value in options.items()})
-    return Options(method=method, model=_entered(model), **options)
+def options_of(method: str, model: Model | None, options: dict[str, Any]) -> DesignOptions | Options:
+    """The options of a method by their names. Raises Refused, BAD_INPUT."""
+    kind: type[DesignOptions] | type[Options] = _OPTIONS.get(method, Options)
+    if kind is Options and method not in (PROCEDURE, *METHODS):
+        text = f"method must be one of {', '.join((*_OPTIONS, PROCEDURE, *METHODS))}, not {method!r}"
+        raise Refused(Reason.BAD_INPUT, text)
+    given = options if kind is not Options else {**options, "method": method, "model": _entered(model)}
+    known = [each.name for each in fields(kind)]
+    for name in given:
+        if name not in known:
+            text = f"{method} has no option {name!r}{did_you_mean(name, known)}; it has: {', '.join(known)}"
+            raise Refused(Reason.BAD_INPUT, text)
+    return kind(**given)
+
+
+_OPTIONS: dict[str, type[DesignOptions]] = {FAST: FastOptions, SETPOINT: DesignOptions}
 
 
 def _entered(model: Model | None) -> FOPDT | SOPDT | None:
@@ -456,20 +332,21 @@ def _loop(file: PlantFile, mode: Mode) -> tuple[RehearsedLoop, Facts]:
         directions=file.directions,
         sp_rate_max_per_s=file.sp_rate_max_per_s or math.inf,
     )  # fmt: skip
-    return _loop_of(plant, facts, mode), facts
+    return loop_of(plant, facts, mode), facts
 
 
 def loop_on(model: Model, facts: Facts, mode: Mode) -> RehearsedLoop:
     """A loop without noise at rest on a model, with SP, PV and MV of 0. Raises ValueError: it cannot be simulated."""
     num, den = list(model.num), list(model.den)
     plant = LinearPlant(num, den, model.L, facts.sample_time_s, mv_low=facts.mv_low, mv_high=facts.mv_high)
-    return _loop_of(plant, facts, mode)
+    return loop_of(plant, facts, mode)
 
 
-def _loop_of(plant: SimulatedProcess, facts: Facts, mode: Mode) -> RehearsedLoop:
+def loop_of(plant: SimulatedProcess, facts: Facts, mode: Mode, setpoint: float = 0.0, mv: float = 0.0) -> RehearsedLoop:
+    """A loop in memory on a process that rests at this MV."""
     span = 1e9
-    settings = Settings(facts.mv_low, facts.mv_high, 0.0, pv_low=-span, pv_high=span, reverse=facts.reverse)
-    channel = Channel(facts.sample_time_s, settings, _parameters(facts.old_gains), 0.0, int(mode), 0.0)
+    settings = Settings(facts.mv_low, facts.mv_high, mv, pv_low=-span, pv_high=span, reverse=facts.reverse)
+    channel = Channel(facts.sample_time_s, settings, _parameters(facts.old_gains), setpoint, int(mode), mv)
     return RehearsedLoop(plant, channel, facts.sample_time_s)
 
 
@@ -494,11 +371,12 @@ def _reach(file: PlantFile) -> float:
     return abs(file.num[-1] / file.den[-1]) * max(map(abs, file.mv_limits)) if file.den[-1] else 0.0
 
 
-def _rehearsal(
-    file: PlantFile | None,
+def _ended(
+    plant: RehearsedPlant,
     method: str,
     outcome: RunResult[Proposal] | RunResult[FastProposal],
     results: dict[str, object],
+    record: RehearsalRecord | None,
     anyway: bool,
 ) -> Rehearsal:
     """Returns how a run of the procedure ended.
@@ -511,14 +389,8 @@ def _rehearsal(
     stages = dict.fromkeys((*STAGES, *chosen_stages(tuple(Excitation), verify=True)))
     times = {stage: outcome.plant_time_s[stage] for stage in stages if stage in outcome.plant_time_s}
     if proposal is not None:
-        return Rehearsal(result_of(proposal), ended, times, results, file)
+        return Rehearsal(result_of(proposal), ended, times, results, plant, record)
     found, result = results.get("ultimate"), empty_result(method)
     if isinstance(found, UltimateResult):
         result = result.model_copy(update={"ultimate": UltimateView(Ku=found.Ku, Pu_s=found.Pu_s)})
-    return Rehearsal(result, ended, times, results, file)
-
-
-def _outcome(ended: Ended | None) -> str:
-    if ended is None:
-        return "proposed"
-    return "no_gain" if isinstance(ended, NoGain) else "failed" if isinstance(ended, Failed) else "refused"
+    return Rehearsal(result, ended, times, results, plant, record)

@@ -218,7 +218,7 @@ class TwoLagModel(_Form):
     L_s: DeadTime
 
     def plant(self) -> SOPDT:
-        return SOPDT.of_time_constants(self.K, self.T1_s, self.T2_s, self.L_s)
+        return SOPDT(K=self.K, T1=self.T1_s, T2=self.T2_s, L=self.L_s)
 
 
 class SecondOrderModel(_Form):

@@ -17,6 +17,7 @@ from loopwright.service.states.job_state import ACTIVE
 from loopwright.service.states.loop_state import gains_of, loop_state
 from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.tuning.analysis.assessment import Assessment, assess
+from loopwright.tuning.fast.by_model import BY_MODEL
 from loopwright.tuning.fast.design import Aim, DesignSpec, OptimalGains, aim_of
 from loopwright.tuning.fast.design_trial import designed_on
 from loopwright.tuning.fast.options import weights_up_to
@@ -24,30 +25,15 @@ from loopwright.tuning.fast.procedure import FAST
 from loopwright.tuning.fast.proposal import delayed
 from loopwright.tuning.fast.record_evaluation import evaluate_again
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
+from loopwright.tuning.models import Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Ended, Reason, Refused
 from loopwright.tuning.rules.design import MIN_GM, MAX_Ms
-from loopwright.tuning.rules.registry import METHODS, Method
-from loopwright.tuning.rules.setting import Setting
-
-
-def _rule(model: Model, Ms: float = 1.6, derivative: bool = False, aim: str = Aim.BALANCED) -> Setting:
-    return Setting(designed_on(model, DesignSpec(Ms, derivative, aim=aim_of(aim)), 0.0).gains, {"Ms": Ms})
-
+from loopwright.tuning.rules.registry import METHODS
 
 ANYWAY = {"propose_anyway": True}
 """Option of such a request: the operator who chooses the gains has seen their figures."""
 NO_GAINS = (Reason.WRONG_SIGN, Reason.CONTROLLER_MISMATCH)
 """Reasons for which a job ends that speak against gains for this controller on any model."""
-FAST_DESIGN = Method(
-    name=FAST,
-    title="The design of fast",
-    source="docs/fast.md",
-    for_what="The best set-point and load answers for a robustness that is asked for.",
-    needs="any stable model, or integrating",
-    takes=(FOPDT, SOPDT, Integrating, TransferFunction),
-    rule=_rule,
-)
 
 
 def alternatives(row: Job, events: Sequence[JobEvent], method: str | None = None) -> JsonObject:
@@ -90,7 +76,7 @@ def redesigned(row: Job, events: Sequence[JobEvent], record: StoredRecord | None
             best = designed_on(model, spec, Ts)
         result = _tuned(best, spec, assess(sampled, best.gains))
     except Ended as refusal:
-        result = MethodResult(FAST_DESIGN, refusal=refusal)
+        result = MethodResult(BY_MODEL, refusal=refusal)
     body = answer(model, [result])
     retune = curves = None
     if result.gains is not None:
@@ -120,7 +106,7 @@ def options_of(spec: DesignSpec) -> dict[str, bool | float | str]:
 
 def _tuned(best: OptimalGains, spec: DesignSpec, assessed: Assessment) -> MethodResult:
     notes = ("Margins and figures are of the model and half a sample's delay.",)
-    return MethodResult(FAST_DESIGN, best.gains, {"Ms": best.Ms, **spec.requirements}, notes, assessed)
+    return MethodResult(BY_MODEL, best.gains, {"Ms": best.Ms, **spec.requirements}, notes, assessed)
 
 
 def asked_spec(row: Job, Ms: float) -> DesignSpec:

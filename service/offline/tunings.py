@@ -17,12 +17,11 @@ from loopwright.service.jsonable import JsonObject, json_object
 from loopwright.service.offline.recommendation import recommended
 from loopwright.tuning.analysis.assessment import Assessment
 from loopwright.tuning.analysis.step_figures import StepFigures
-from loopwright.tuning.fast.by_model import BY_MODEL
-from loopwright.tuning.fast.tuned import method_of, tune
+from loopwright.tuning.fast.tuned import METHODS, method_of, tune
 from loopwright.tuning.gains import Gains, to_parallel
 from loopwright.tuning.models import Model
 from loopwright.tuning.reasons import Ended, Failed, Reason, Refused
-from loopwright.tuning.rules.registry import METHODS, Method, Option
+from loopwright.tuning.rules.registry import Method, Option
 
 ALL = "all"
 FORM = "ISA: u = Kp*(b*SP - PV + integral(SP - PV)/Ti + Td*d/dt(c*SP - PV)/(1 + Tf*s)); Ti = 0: no integral"
@@ -66,7 +65,7 @@ class MethodResult:
 
 
 def tune_model(model: Model, method: str = ALL, options: Mapping[str, object] | None = None) -> list[MethodResult]:
-    """Tunes the model by the method named, or by all in the order of the registry.
+    """Tunes the model by the method named, or by all in their order.
 
     Each option goes to the methods that have it. A method that refuses the model is in the list with its refusal.
 
@@ -82,7 +81,7 @@ def tune_each(model: Model, names: Sequence[str], options: Mapping[str, object] 
         try:
             methods.append(method_of(name))
         except Refused as refused:
-            raise BadTuning(f"{refused.detail}{did_you_mean(name, [BY_MODEL.name, *METHODS])}") from None
+            raise BadTuning(f"{refused.detail}{did_you_mean(name, list(METHODS))}") from None
     asked = options or {}
     for name, value in asked.items():
         _check(methods, name, value)
@@ -150,8 +149,8 @@ def as_json(found: MethodResult) -> JsonObject:
     )
 
 
-def methods_json() -> list[dict[str, object]]:
-    """Returns the registry as the JSON array of GET /methods and `loopwright methods --json`."""
+def methods_json(methods: Mapping[str, Method] = METHODS) -> list[dict[str, object]]:
+    """Returns the methods as the JSON array of GET /methods and `loopwright methods --json`."""
     return [
         {
             "method": method.name,
@@ -161,7 +160,7 @@ def methods_json() -> list[dict[str, object]]:
             "needs": method.needs,
             "options": {name: _option(option) for name, option in method.options.items()},
         }
-        for method in METHODS.values()
+        for method in methods.values()
     ]
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.refusals import cases, draw, rehearsed
-from loopwright.service.cli.rehearsed import RehearsedJob, RehearsedSamples
+from loopwright.service.cli.rehearsed import RehearsedJob, shown_samples
+from loopwright.service.execution.rehearsed import RehearsalRecord
 from loopwright.service.jobs.stored_record import stored_record
 from loopwright.tuning.fast.design import DesignSpec
 from loopwright.tuning.fast.record_evaluation import evaluate_again
@@ -19,7 +20,7 @@ WITH_FIT = {"unexplained", "disturbed", "uncertain", "model_mismatch", "controll
 
 
 @cache
-def job_of(reason: str) -> tuple[RehearsedJob, RehearsedSamples]:
+def job_of(reason: str) -> tuple[RehearsedJob, RehearsalRecord]:
     return rehearsed(cases()[reason])
 
 
@@ -43,7 +44,7 @@ def test_a_fault_is_refused_with_its_reason_and_shown(reason: str, tmp_path: Pat
 @pytest.mark.parametrize("Ms", [1.4, 1.6])
 def test_what_the_step_has_refuted_is_no_alternative_either(Ms: float) -> None:
     """The record as a whole fits well, with load disturbances added: only its parts tell."""
-    record = stored_record(job_of("model_mismatch")[1].columns(None).columns())
+    record = stored_record(shown_samples(job_of("model_mismatch")[1], None).columns())
     assert record is not None
     evidence = record.experiment_record()
     assert evidence is not None and len(evidence.steps) == 2

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 
 from loopwright.tuning.analysis.stability import is_stable, open_loop
-from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import Complexes, Model, Reals
+from loopwright.tuning.gains import AnyGains, Gains, as_gains
+from loopwright.tuning.models import AnyModel, Complexes, Model, Reals, as_model
 from loopwright.tuning.reasons import Reason, Refused
 
 POINTS_PER_DECADE = 600
@@ -30,13 +30,16 @@ CROSSINGS = 40
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """The stability margins of a loop. A margin without its crossover is None, and so is its frequency.
+    """The stability margins of a loop. A margin without its crossover is None, and so is its frequency. The frequencies
+    have the names of `control.stability_margins`.
 
     GM: the gain margin, a ratio: the smallest factor above one that takes a stable loop to its stability limit.
     PM_deg: the phase margin, degrees.
     Ms, Mt: the peaks of |1/(1+L)| and |L/(1+L)|.
-    wc, wpc: the gain crossover and the phase crossover, rad/s.
-    ws: the frequency of the peak Ms, rad/s; the highest one looked at where |1/(1+L)| is largest in the limit.
+    delay_margin_s: the smallest further dead time that takes the loop to its stability limit, s; None for a loop that
+    is not stable, or that no dead time makes unstable.
+    wgc, wpc: the gain crossover and the phase crossover, rad/s.
+    wms: the frequency of the peak Ms, rad/s; the highest one looked at where |1/(1+L)| is largest in the limit.
     bandwidth: the frequency at which |L/(1+L)| first falls to 1/sqrt(2) of its value at rest, rad/s.
     stable: whether the loop is stable, exactly (see `tuning.analysis.stability`). The other figures of an unstable loop
     describe the curve and are no margins.
@@ -46,46 +49,39 @@ class Margins:
     PM_deg: float | None
     Ms: float
     Mt: float
-    wc: float | None
+    delay_margin_s: float | None
+    wgc: float | None
     wpc: float | None
-    ws: float
+    wms: float
     bandwidth: float | None
     stable: bool
 
-    @property
-    def delay_margin_s(self) -> float | None:
-        """The additional dead time at which the loop reaches its stability limit at the gain crossover wc, s."""
-        if self.PM_deg is None or self.wc is None:
-            return None
-        return math.radians(self.PM_deg) / self.wc
 
-
-def margins(model: Model, gains: Gains) -> Margins:
+def margins(model: AnyModel, gains: AnyGains) -> Margins:
     """The margins of the loop of this model and these gains; Tf = 0 is the ideal derivative.
 
-    Raises Refused, BAD_INPUT: gains out of range, or an ideal derivative on a bi-proper plant.
+    Raises Refused, BAD_INPUT: gains out of range, or an ideal derivative on a bi-proper plant. Raises TypeError for
+    what is no model or has no gains.
     """
-    N, D = open_loop(model, gains)
-    stable = is_stable(model, gains)
+    plant, in_effect = as_model(model), as_gains(gains)
+    N, D = open_loop(plant, in_effect)
+    stable = is_stable(plant, in_effect)
 
     def loop(w: Reals) -> Complexes:
         s = 1j * w
-        return np.asarray(np.polyval(N, s) / np.polyval(D, s) * np.exp(-model.L * s))
+        return np.asarray(np.polyval(N, s) / np.polyval(D, s) * np.exp(-plant.L * s))
 
     def at(w: float) -> complex:
         return complex(loop(np.array([w]))[0])
 
-    roots = np.concatenate((np.roots(N), np.roots(D)))
-    w = _grid(model, N, D, roots)
-    if len(modes := _modes(roots)):
-        w = np.union1d(w, modes)
+    w = frequency_grid(plant, N, D)
     L = loop(w)
 
     def nearness(x: float) -> float:
         return abs(1.0 + at(x))
 
     ws, minimum = _min(nearness, w, int(np.argmin(np.abs(1.0 + L))))
-    turn = _turn(model, w, L, minimum) if stable else w[:0]
+    turn = _turn(plant, w, L, minimum) if stable else w[:0]
     if len(turn) and np.min(np.abs(1.0 + loop(turn))) < minimum:
         w = np.sort(np.concatenate((w, turn)))
         L = loop(w)
@@ -101,32 +97,30 @@ def margins(model: Model, gains: Gains) -> Margins:
         if size > inverse_gm and not (stable and size >= 1.0):
             wpc, inverse_gm = x, size
 
-    wc, pm = None, None
+    wgc, pm, delay = None, None, math.inf
     everywhere = np.ones(w.shape, dtype=bool)
     for x in _crossings(lambda v: np.log(np.abs(loop(v))), w, np.log(np.abs(L)), everywhere, np.abs(L)):
-        here = abs(float(np.degrees(np.angle(-at(x)))))
-        if pm is None or here < pm:
-            wc, pm = x, here
+        angle = float(np.angle(-at(x)))
+        if pm is None or abs(angle) < math.radians(pm):
+            wgc, pm = x, abs(math.degrees(angle))
+        # a dead time turns the curve clockwise; farther up a smaller one is enough
+        delay = min(delay, angle % (2.0 * math.pi) / x)
 
-    gain, nearest = _at_infinity(model, N, D)
+    gain, nearest = _at_infinity(plant, N, D)
+    if gain >= 1.0:
+        delay = 0.0
     return Margins(
         GM=1.0 / inverse_gm if inverse_gm > 0.0 else None,
         PM_deg=pm,
         Ms=1.0 / max(min(minimum, nearest), 1e-12),
         Mt=max(-mt, gain / max(nearest, 1e-12)),
-        wc=wc,
+        delay_margin_s=delay if stable and delay < math.inf else None,
+        wgc=wgc,
         wpc=wpc,
-        ws=ws,
+        wms=ws,
         bandwidth=_bandwidth(loop, w, closed, N, D),
         stable=stable,
     )
-
-
-def delay_margin_s(model: Model, gains: Gains) -> float | None:
-    """The delay margin of the loop, s; None for a loop that is not stable, or has no gain crossover. Raises as
-    `margins`."""
-    found = margins(model, gains)
-    return found.delay_margin_s if found.stable else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +135,7 @@ class Ultimate:
     Pu_s: float
 
 
-def ultimate_point(model: Model) -> tuple[float, float]:
+def ultimate_point(model: AnyModel) -> tuple[float, float]:
     """The ultimate point (Ku, Pu): the positive gain at which a P loop just oscillates, and the period in s.
 
     Raises Refused, CANNOT_OSCILLATE, for a model without an ultimate point.
@@ -152,9 +146,17 @@ def ultimate_point(model: Model) -> tuple[float, float]:
     return found.GM, 2.0 * math.pi / found.wpc
 
 
+def frequency_grid(model: Model, N: Reals, D: Reals) -> Reals:
+    """The frequency grid of the loop N/D with the model's dead time, rad/s: from well below the slowest to well above
+    the fastest corner, to a decade beyond the gain crossover where a high gain moves that farther up, and dense about
+    lightly damped poles and zeros."""
+    roots = np.concatenate((np.roots(N), np.roots(D)))
+    w, modes = _grid(model, N, D, roots), _modes(roots)
+    return np.asarray(np.union1d(w, modes)) if len(modes) else w
+
+
 def _grid(model: Model, N: Reals, D: Reals, roots: Complexes) -> Reals:
-    """The frequency grid, rad/s, from well below the slowest to well above the fastest corner of the loop, and to a
-    decade beyond the gain crossover where a high gain moves that farther up. roots: those of N and D."""
+    """The grid without the part about lightly damped poles and zeros. roots: those of N and D."""
     corners = [float(x) for x in np.abs(roots) if x > 0.0]
     kept = np.trim_zeros(D, "b")
     origin = len(D) - len(kept)

@@ -16,8 +16,8 @@ import numpy as np
 from loopwright.tuning.analysis.closed_loop import ClosedLoop
 from loopwright.tuning.analysis.stability import is_stable, open_loop
 from loopwright.tuning.analysis.step_figures import StepFigures, response_figures
-from loopwright.tuning.gains import Gains
-from loopwright.tuning.models import Model, Reals, TransferFunction, integrators
+from loopwright.tuning.gains import AnyGains, Gains, as_gains
+from loopwright.tuning.models import AnyModel, Model, Reals, TransferFunction, as_model, integrators
 from loopwright.tuning.reasons import Reason, Refused
 
 MAX_STEPS = 40_000
@@ -41,8 +41,8 @@ class Response:
 
 
 def step_figures(
-    model: Model,
-    gains: Gains,
+    model: AnyModel,
+    gains: AnyGains,
     horizon: float | None = None,
     dt: float | None = None,
     load: bool = False,
@@ -52,8 +52,9 @@ def step_figures(
 
     horizon, dt: the length and the step of the simulation, s; see `step_response` for the defaults.
     band: the settling band, as a fraction of the final change (after a load disturbance: of the peak).
-    Raises Refused: NOT_ROBUST for an unstable loop, BAD_INPUT as `step_response`.
+    Raises Refused: NOT_ROBUST for an unstable loop, BAD_INPUT as `step_response`. Raises TypeError as that.
     """
+    model, gains = as_model(model), as_gains(gains)
     _require_stable(model, gains)
     response = step_response(model, gains, horizon, dt, load)
     final = final_value(model, gains, load)
@@ -80,7 +81,7 @@ def final_value(model: Model, gains: Gains, load: bool) -> float:
 
 
 def step_response(
-    model: Model, gains: Gains, horizon: float | None = None, dt: float | None = None, load: bool = False
+    model: AnyModel, gains: AnyGains, horizon: float | None = None, dt: float | None = None, load: bool = False
 ) -> Response:
     """The response of the loop from rest to a unit set-point step, or (load) to a unit load disturbance, at t = 0.
 
@@ -90,8 +91,10 @@ def step_response(
     the horizon is replaced by its second-order Pade approximant.
 
     Raises Refused: NOT_ROBUST for an unstable loop when no horizon is given, or when its response overflows; BAD_INPUT
-    for gains out of range or an ideal derivative on a bi-proper plant.
+    for gains out of range or an ideal derivative on a bi-proper plant. Raises TypeError for what is no model or has no
+    gains.
     """
+    model, gains = as_model(model), as_gains(gains)
     for name, value in (("horizon", horizon), ("dt", dt)):
         if value is not None and not (math.isfinite(value) and value > 0.0):
             raise Refused(Reason.BAD_INPUT, f"{name} = {value} s: must be positive")

@@ -14,10 +14,14 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import AnyModel, Model, as_model
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.design import realisable
-from loopwright.tuning.rules.registry import METHODS, Method
+from loopwright.tuning.rules.registry import METHODS as RULES
+from loopwright.tuning.rules.registry import Method
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+METHODS: dict[str, Method] = {**RULES, BY_MODEL.name: BY_MODEL}
+"""Every method for a known model by its name: the rules, and the design of fast."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +42,7 @@ class Tuned:
     notes: tuple[str, ...]
     assessment: Assessment
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         g, found = self.gains, self.assessment
         derivative = f", Td {g.Td:.4g} s, Tf {g.Tf:.4g} s" if g.Td else ""
         gains = f"{self.method.title}: Kp {g.Kp:.4g}, Ti {g.Ti:.4g} s{derivative}"
@@ -94,13 +98,9 @@ class Tuned:
 
 
 def method_of(name: str) -> Method:
-    """The method of this name for a known model: a rule of `METHODS`, or the design of fast. Raises Refused,
-    BAD_INPUT."""
-    if name == BY_MODEL.name:
-        return BY_MODEL
-    if name not in METHODS:
-        known = ", ".join((*METHODS, BY_MODEL.name))
-        raise Refused(Reason.BAD_INPUT, f"method must be one of {known}, not {name!r}")
+    """The method of this name in `METHODS`. Raises Refused, BAD_INPUT."""
+    if not isinstance(name, str) or name not in METHODS:
+        raise Refused(Reason.BAD_INPUT, f"method must be one of {', '.join(METHODS)}, not {name!r}")
     return METHODS[name]
 
 
@@ -114,8 +114,8 @@ def tune(
 
     model: a model of this library, what `identify` has found, a transfer function of another library (control,
     scipy.signal), or a model by names, as `as_model` takes it.
-    method, options: a name of `METHODS`, and options of that method; or "fast", whose design for a maximum sensitivity
-    (ms=1.6) is the one that the procedure `tuning.fast` makes of the model that it has found.
+    method, options: a name of `METHODS`, and options of that method. "fast", designed for a maximum sensitivity
+    (Ms=1.6), is the design that the procedure `tuning.fast` makes of the model that it has found.
     dead_time_s: the dead time of a transfer function of another library, s.
     Raises Refused: BAD_INPUT (method, option), or as the rule does: NOT_SELF_REGULATING, OUTSIDE_RANGE,
     CANNOT_OSCILLATE. Raises TypeError for what is no model, ValueError for coefficients that make none.

@@ -147,7 +147,7 @@ class Identified:
     candidates: tuple[Candidate, ...]
     notes: tuple[str, ...]
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         known = ", ".join(f"{n} {v:.4g} ± {self.standard_errors[n]:.2g}" for n, v in self.parameters.items())
         return f"{known}; fit {self.fit_pct:.1f} %"
 

@@ -44,7 +44,7 @@ def recorded_test(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | No
     u_before: MV before the record, by default the first value of u.
     Raises Refused: BAD_INPUT, naming the sample that cannot be used; NO_RESPONSE for a constant PV.
     """
-    time, mv, pv = (_column(name, values) for name, values in (("t", t), ("u", u), ("y", y)))
+    time, mv, pv = (column(name, values) for name, values in (("t", t), ("u", u), ("y", y)))
     if not len(time) == len(mv) == len(pv):
         raise _bad(f"t, u and y must be equally long; they have {len(time)}, {len(mv)} and {len(pv)} samples")
     if len(time) < MIN_SAMPLES:
@@ -70,7 +70,8 @@ def recorded_test(t: ArrayLike, u: ArrayLike, y: ArrayLike, u_before: float | No
     return RecordedTest(Ts, mv, pv, before, first)
 
 
-def _column(name: str, values: ArrayLike) -> Reals:
+def column(name: str, values: ArrayLike) -> Reals:
+    """One column of a record, shape (N,). Raises Refused, BAD_INPUT, naming the sample that cannot be used."""
     try:
         column = np.asarray(values, dtype=float)
     except (TypeError, ValueError):

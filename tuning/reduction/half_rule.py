@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from loopwright.tuning.models import FOPDT, SOPDT, Complexes, Integrating, Model, TransferFunction
+from loopwright.tuning.models import FOPDT, SOPDT, AnyModel, Complexes, Integrating, Model, TransferFunction, as_model
 from loopwright.tuning.reasons import Reason, Refused
 
 REAL, REAL_MAX = 0.01, 0.2
@@ -26,12 +26,13 @@ ring of n equal lags is as wide as eps^(1/n), so the bound grows from order 7 on
 above which a pair is taken for real lags is 0.99995 up to order 6, 0.999 at order 8 and 0.98 from order 12 on."""
 
 
-def half_rule(model: Model, order: Literal[1, 2] = 1) -> FOPDT | SOPDT | Integrating:
+def half_rule(model: AnyModel, order: Literal[1, 2] = 1) -> FOPDT | SOPDT | Integrating:
     """The model reduced to `order` lags, an integrator being one of them; a model with no more lags is returned as it
     is.
 
     Raises Refused, OUTSIDE_RANGE, for complex or unstable poles and for zeros in the left half-plane.
     """
+    model = as_model(model)
     gain, integrates, lags, dead = _parts(model)
     kept = order - 1 if integrates else order
     if len(lags) <= kept and not isinstance(model, TransferFunction):
@@ -46,7 +47,7 @@ def half_rule(model: Model, order: Literal[1, 2] = 1) -> FOPDT | SOPDT | Integra
         return Integrating(gain, dead, lags[0] if lags else 0.0)
     if len(lags) == 1:
         return FOPDT(gain, lags[0], dead)
-    return SOPDT.of_time_constants(gain, lags[0], lags[1], dead)
+    return SOPDT(K=gain, T1=lags[0], T2=lags[1], L=dead)
 
 
 def exact(model: TransferFunction) -> Model:

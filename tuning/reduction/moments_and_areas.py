@@ -8,27 +8,29 @@ from collections.abc import Iterable
 import numpy as np
 from scipy.linalg import companion, expm, matrix_balance
 
-from loopwright.tuning.models import FOPDT, Model, integrators, monic
+from loopwright.tuning.models import FOPDT, AnyModel, Model, as_model, integrators, monic
 from loopwright.tuning.reasons import Reason, Refused
 
 
-def moments(model: Model) -> FOPDT:
+def moments(model: AnyModel) -> FOPDT:
     """The FOPDT model with the mean and the variance of the model's impulse response: T = sqrt(variance), L = mean - T.
 
     The reduction reproduces the FOPDT models of Romasevych et al., PI-controller tuning optimization via PSO-based
     technique. Raises Refused: NOT_SELF_REGULATING; BAD_INPUT for unstable poles, or moments that no FOPDT model has.
     """
+    model = as_model(model)
     _require_self_regulating(model)
     mean, variance = _moments(model)
     return fopdt_of_moments(model.static_gain, mean, variance)
 
 
-def two_areas(model: Model) -> FOPDT:
+def two_areas(model: AnyModel) -> FOPDT:
     """The FOPDT model by the areas above and below the step response (area method), computed exactly.
 
     A0 = integral of 1 - y/K = T + L;  A1 = integral of y/K from 0 to A0 = T/e. Source: K. J. Astrom, T. Hagglund, PID
     Controllers: Theory, Design and Tuning (1995), section 2.4. Raises Refused as `moments`.
     """
+    model = as_model(model)
     _require_self_regulating(model)
     mean, _ = _moments(model)
     return fopdt_of_areas(model.static_gain, mean, _area_to(model, max(mean - model.L, 0.0)))

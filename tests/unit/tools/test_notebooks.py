@@ -22,5 +22,5 @@ def test_a_notebook_runs(path: Path, tmp_path: Path) -> None:
     assert shown and not [each for each in shown if each.output_type == "error"]
 
 
-def test_there_are_three() -> None:
-    assert len(NOTEBOOKS) == 3
+def test_there_are_four() -> None:
+    assert len(NOTEBOOKS) == 4

@@ -53,7 +53,7 @@ def test_the_wheel_has_one_name_on_top_and_every_file(built: Path) -> None:
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
     in_repository = run("git", "ls-files", "--cached", "--others", "--exclude-standard", *FOLDERS, folder=ROOT).split()
     wanted = {f"loopwright/{name}" for name in in_repository if not name.endswith((".md", "/start", "/Dockerfile"))}
-    assert names == wanted | {"loopwright/__init__.py", "loopwright/py.typed"}
+    assert names == wanted | {f"loopwright/{name}" for name in ("__init__.py", "py.typed", "rehearsal.py")}
 
 
 @pytest.mark.timeout(2 * PATIENCE_S)

@@ -48,6 +48,7 @@ KEPT = {
     ("tuning/fast/proposal.py", "span"),  # a key of stored results
     ("tuning/fast/relay_test.py", "span"),
     ("tuning/analysis/comparison.py", "verdict"),  # a key of stored results
+    ("tuning/operation/recorded_operation.py", "verdict"),
 }
 SAME_THING_TWICE = {"Mode"}
 """The controller's mode: `tuning` must not import `protocol`, so both have the enumeration."""

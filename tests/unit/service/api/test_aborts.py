@@ -107,9 +107,7 @@ def with_a_key_of_another_request(client: TestClient, path: str) -> int:
     return client.post(path, json={"by": "me"}, headers=KEY).status_code
 
 
-@pytest.mark.parametrize(
-    ("ask", "status"), [(without_a_turn, 503), (with_a_key_of_another_request, 422)]
-)
+@pytest.mark.parametrize(("ask", "status"), [(without_a_turn, 503), (with_a_key_of_another_request, 422)])
 def test_a_refused_one_is_heard_and_written_down(
     service: Service, client: TestClient, ask: Callable[[TestClient, str], int], status: int
 ) -> None:

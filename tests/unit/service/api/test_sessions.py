@@ -131,7 +131,9 @@ def test_bearer_keys_are_as_before(browsers: Browsers) -> None:
     bearer = {"Authorization": f"Bearer {browsers.keyring.create('script', Scope.OPERATE)[1]}"}
     assert browser.get("/session", headers=bearer).json()["name"] == "script"
     assert browser.get("/session", headers=bearer).json()["csrf"] is None
-    answer = browser.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}, headers=bearer | {"Origin": "https://any.example"})
+    answer = browser.post(
+        f"/loops/{TAG}/retune", json={"requested_by": "me"}, headers=bearer | {"Origin": "https://any.example"}
+    )
     assert answer.status_code == 202
     assert_problem(browser.delete("/session", headers=bearer), 409)
     assert browser.get("/loops", headers={"Authorization": "Bearer wrong"}).status_code == 401

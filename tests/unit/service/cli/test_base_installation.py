@@ -30,6 +30,16 @@ RUN = (
     "sys.argv[0] = 'loopwright'\n"
     "main()\n"
 )
+TANK = """
+from loopwright import rehearsal, tuning
+
+class Tank:
+    sample_time_s, t95_s, level = 1.0, 130.0, 1.0
+
+    def step(self, mv):
+        self.level += 0.05 * (mv / 50.0 - self.level**0.5)
+        return self.level
+"""
 MODEL = '{"K": 0.8, "T_s": 120, "L_s": 15}'
 
 
@@ -49,6 +59,7 @@ def loopwright(*arguments: str) -> subprocess.CompletedProcess[str]:
         ("identify", "plain.csv", "--tune", "--json"),
         ("rehearse", "plant.json"),
         ("rehearse", "plant.json", "--json"),
+        ("rehearse", "tank.py:Tank", "--json"),
         ("--version",),
         ("--help",),
     ],
@@ -57,7 +68,9 @@ def loopwright(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_it_works_without_the_extras(arguments: tuple[str, ...], tmp_path: Path) -> None:
     (tmp_path / "plain.csv").write_bytes(FILES["plain"].content)
     (tmp_path / "plant.json").write_text(json.dumps({"K": 2.0, "T_s": 5.0, "L_s": 1.0}))
-    paths = [str(tmp_path / each) if each.endswith((".csv", "plant.json")) else each for each in arguments]
+    (tmp_path / "tank.py").write_text(TANK)
+    files = (".csv", "plant.json", ".py:Tank")
+    paths = [str(tmp_path / each) if each.endswith(files) else each for each in arguments]
     ended = loopwright(*paths)
     assert ended.returncode == 0, ended.stderr
     if "--json" in arguments:

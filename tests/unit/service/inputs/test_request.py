@@ -95,7 +95,7 @@ def test_a_requirement_is_not_of_the_five_stages() -> None:
     [
         (MODEL, FOPDT(2.0, 10.0, 3.0)),
         (MODEL | {"zeta": 0.5}, SOPDT(2.0, 10.0, 0.5, 3.0)),
-        ({"K": 2, "T1_s": 10, "T2_s": 4, "L_s": 3}, SOPDT.of_time_constants(2.0, 10.0, 4.0, 3.0)),
+        ({"K": 2, "T1_s": 10, "T2_s": 4, "L_s": 3}, SOPDT(K=2.0, T1=10.0, T2=4.0, L=3.0)),
     ],
 )
 def test_a_model_to_enter_with(model: dict[str, Any], plant: FOPDT | SOPDT) -> None:

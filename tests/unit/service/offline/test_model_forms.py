@@ -93,7 +93,7 @@ def test_everything_else_is_named(data: object, words: str) -> None:
 
 def test_in_words() -> None:
     assert describe({"K": 0.1, "L_s": 3.0, "integrating": True}) == "integrating, K 0.1, L 3 s"
-    assert describe(dump_model(SOPDT.of_time_constants(2.0, 4.0, 10.0, 3.0))) == "K 2, T1 10 s, T2 4 s, L 3 s"
+    assert describe(dump_model(SOPDT(K=2.0, T1=4.0, T2=10.0, L=3.0))) == "K 2, T1 10 s, T2 4 s, L 3 s"
     assert describe(dump_model(SOPDT(2.0, 4.0, 0.5, 3.0))) == "K 2, T 4 s, zeta 0.5, L 3 s"
     assert describe({"num": [2.0], "den": [10.0, 1.0], "dead_time_s": 3.0}) == "num [2], den [10, 1], dead time 3 s"
 

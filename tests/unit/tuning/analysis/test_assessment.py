@@ -67,14 +67,12 @@ def test_ideal_pid_with_exact_dead_time(row: dict[str, Any]) -> None:
 def test_the_loop_of_direct_synthesis(row: dict[str, Any]) -> None:
     # the PID cancels both lags: c*exp(-x)/x, x = 3 s
     c, theta = row["c"], 3.0
-    found = assess(
-        SOPDT.of_time_constants(2.0, 7.0, 4.0, theta), Gains(c * 11.0 / (2.0 * theta), 11.0, 28.0 / 11.0, c=1.0)
-    )
+    found = assess(SOPDT(K=2.0, T1=7.0, T2=4.0, L=theta), Gains(c * 11.0 / (2.0 * theta), 11.0, 28.0 / 11.0, c=1.0))
     m, figures = found.margins, found.setpoint
     assert figures is not None
     assert pytest.approx(math.pi / (2.0 * c), rel=1e-6) == m.GM
     assert m.PM_deg == pytest.approx(90.0 - math.degrees(c), abs=1e-4)
-    assert m.wc == pytest.approx(c / theta, rel=1e-6)
+    assert m.wgc == pytest.approx(c / theta, rel=1e-6)
     assert m.delay_margin_s == pytest.approx((math.pi / 2.0 - c) / c * theta, rel=1e-5)
     assert m.Ms == pytest.approx(row["Ms"], rel=1e-4)
     assert pytest.approx(theta * math.cos(c) / (2.0 * c * (1.0 - math.sin(c))), rel=1e-3) == figures.ISE

@@ -165,7 +165,7 @@ def test_margins_against_python_control(model: Model, gains: Gains) -> None:
     assert found.stable
     gm, pm, sm, wpc, wc, _ = control.stability_margins(loop)
     assert found.PM_deg == pytest.approx(pm, abs=0.01)
-    assert found.wc == pytest.approx(wc, rel=1e-4)
+    assert found.wgc == pytest.approx(wc, rel=1e-4)
     if math.isinf(gm) or gm < 1.0:
         assert found.GM is None
     else:

@@ -44,7 +44,7 @@ def test_normalised_is_the_same_plant_in_other_units(model: Model) -> None:
 
 
 def test_time_sum() -> None:
-    assert time_sum(SOPDT.of_time_constants(1.0, 3.0, 2.0, 0.5)) == pytest.approx(5.5)
+    assert time_sum(SOPDT(K=1.0, T1=3.0, T2=2.0, L=0.5)) == pytest.approx(5.5)
     assert time_sum(Integrating(1.0, 0.0)) == 0.0
 
 

@@ -38,7 +38,7 @@ CASES = {
     "first order": (FIRST_ORDER, FOPDT(2.0, 10.0, 2.03)),
     "negative gain": (NEGATIVE, FOPDT(-1.5, 8.0, 2.0)),
     "no dead time": (PROMPT, FOPDT(1.0, 5.0, 0.0)),
-    "two lags": (TWO_LAGS, SOPDT.of_time_constants(2.0, 10.0, 5.0, 1.04)),
+    "two lags": (TWO_LAGS, SOPDT(K=2.0, T1=10.0, T2=5.0, L=1.04)),
     "equal lags": (EQUAL_LAGS, SOPDT(2.0, 5.0, 1.0, 1.0)),
     "complex poles": (COMPLEX_POLES, SOPDT(1.0, 3.0, 0.3, 1.77)),
     "integrates": (INTEGRATES, Integrating(0.1, 1.0)),

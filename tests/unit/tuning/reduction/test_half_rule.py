@@ -117,7 +117,7 @@ def test_a_plant_that_oscillates_is_refused_at_any_order(n: int, zeta: float) ->
 def test_a_model_of_that_order_is_left_alone(T: float, ratio: float) -> None:
     for model, order in ((FOPDT(1.0, T, 1.0), 1), (Integrating(1.0, 1.0, T), 2)):
         assert half_rule(model, order) is model
-    second = SOPDT.of_time_constants(1.0, T, ratio * T, 1.0)
+    second = SOPDT(K=1.0, T1=T, T2=ratio * T, L=1.0)
     assert half_rule(second, 2) is second
 
 
@@ -173,7 +173,7 @@ def test_the_tangent_of_a_response_differentiated(T2: float) -> None:
     y = 1.0 - (np.exp(-t) - T2 * np.exp(-t / T2)) / (1.0 - T2) if T2 < 0.9 else equal
     slope = np.gradient(y, t)
     i = int(np.argmax(slope))
-    found = tangent(SOPDT.of_time_constants(4.0, 1.0, T2, 0.3))
+    found = tangent(SOPDT(K=4.0, T1=1.0, T2=T2, L=0.3))
     assert found.K == 4.0
     assert pytest.approx(1.0 / slope[i], rel=1e-5) == found.T
     assert pytest.approx(0.3 + t[i] - y[i] / slope[i], rel=1e-4) == found.L

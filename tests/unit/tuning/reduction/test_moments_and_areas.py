@@ -82,7 +82,7 @@ def test_two_areas_of_eight_equal_lags_in_any_unit_of_time(lag: float) -> None:
     [
         (TransferFunction((1.0,), (1.0, 3.0, 3.0, 1.0)), 1.73205, 1.26795),
         (TransferFunction((-0.1, 1.0), (1.0, 3.0, 3.0, 1.0)), 1.72916, 1.37084),
-        (SOPDT.of_time_constants(1.0, 0.5, 0.5, 1.0), 0.70711, 1.29289),
+        (SOPDT(K=1.0, T1=0.5, T2=0.5, L=1.0), 0.70711, 1.29289),
     ],
     ids=["G2", "G3", "G5"],
 )

@@ -18,7 +18,7 @@ PLANTS: dict[str, dict[str, Any]] = TABLES["me_pso"]["plants"]
 def sopdt(name: str) -> SOPDT:
     """An object of the direct-synthesis paper."""
     o = OBJECTS[name]
-    return SOPDT.of_time_constants(o["K"], o["T1"], o["T2"], o["L"])
+    return SOPDT(K=o["K"], T1=o["T1"], T2=o["T2"], L=o["L"])
 
 
 def plant(name: str) -> TransferFunction:

@@ -121,7 +121,7 @@ def test_Ms_at_the_end_of_the_safe_range_of_imc(loop: str, name: str, model: Mod
     [
         ("imc-pi", FOPDT(2.0, 5.0, 1.5), "taylor", [-1 / 5.0]),
         ("imc-pi", Integrating(2.0, 1.5), "taylor", [-1 / 4.0]),
-        ("imc-pid", SOPDT.of_time_constants(2.0, 5.0, 3.0, 1.5), "taylor", [-1 / 5.0, -1 / 3.0]),
+        ("imc-pid", SOPDT(K=2.0, T1=5.0, T2=3.0, L=1.5), "taylor", [-1 / 5.0, -1 / 3.0]),
         ("imc-pid", FOPDT(2.0, 5.0, 1.5), "pade", [-1 / 5.0, -2 / 1.5]),
         ("imc-pid", Integrating(2.0, 1.5), "pade", [-1 / 4.0, -2 / 1.5]),
         ("lambda", FOPDT(2.0, 5.0, 1.5), "taylor", [-1 / 5.0]),
@@ -195,7 +195,7 @@ def test_margins_of_simc() -> None:
     assert peak_sensitivity(Integrating(1.0, 1.0), gains) == pytest.approx(1.70, rel=3e-3)
 
 
-@pytest.mark.parametrize("model", [SOPDT.of_time_constants(2.0, 30.0, 4.0, 1.0), Integrating(2.0, 1.0, 4.0)])
+@pytest.mark.parametrize("model", [SOPDT(K=2.0, T1=30.0, T2=4.0, L=1.0), Integrating(2.0, 1.0, 4.0)])
 def test_the_pid_of_simc_is_a_pi_and_a_cancelled_lag(model: SOPDT | Integrating) -> None:
     simpler = FOPDT(2.0, 30.0, 1.0) if isinstance(model, SOPDT) else Integrating(2.0, 1.0)
     pi, pid = tune("simc", simpler, tau_c_s=2.0).gains, tune("simc", model, controller="pid", tau_c_s=2.0).gains

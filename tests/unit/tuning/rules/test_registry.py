@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from loopwright.tuning.fast.tuned import METHODS as ALL
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.registry import METHODS, Method, Option, tune
@@ -22,7 +23,7 @@ QUICK = [name for name in NAMES if name != "me-pso"]
 
 SAMPLES: dict[type[Model], Model] = {
     FOPDT: FOPDT(2.0, 10.0, 4.0),
-    SOPDT: SOPDT.of_time_constants(2.0, 10.0, 3.0, 2.0),
+    SOPDT: SOPDT(K=2.0, T1=10.0, T2=3.0, L=2.0),
     Integrating: Integrating(0.1, 2.0),
     TransferFunction: TransferFunction((-0.5, 1.0), (1.0, 3.0, 3.0, 1.0), 1.0),
 }
@@ -35,11 +36,11 @@ def refusal(name: str, model: Model, **options: Any) -> Refused:
 
 
 def test_the_list() -> None:
-    assert list(METHODS) == NAMES
-    assert all(method.name == name for name, method in METHODS.items())
+    assert list(METHODS) == NAMES and list(ALL) == [*NAMES, "fast"]
+    assert all(method.name == name for name, method in ALL.items())
 
 
-@pytest.mark.parametrize("method", METHODS.values(), ids=NAMES)
+@pytest.mark.parametrize("method", ALL.values(), ids=list(ALL))
 def test_every_method_is_described(method: Method) -> None:
     assert all((method.title, method.source, method.needs, method.takes))
     assert method.for_what.endswith(".")
@@ -51,11 +52,11 @@ def test_the_documented_table() -> None:
     shown = [line for line in lines if line.startswith("| `")]
     assert shown == [
         f"| `{m.name}` | {m.for_what} | {m.needs} | {', '.join(f'`{name}`' for name in m.options)} |"
-        for m in METHODS.values()
+        for m in ALL.values()
     ]
 
 
-@pytest.mark.parametrize("method", METHODS.values(), ids=NAMES)
+@pytest.mark.parametrize("method", ALL.values(), ids=list(ALL))
 def test_options_are_those_of_the_rule(method: Method) -> None:
     """Same names, same defaults: what is shown is what is used."""
     keywords = {
@@ -97,7 +98,7 @@ def test_reduction_is_noted() -> None:
     assert "second order with K = 1, T1 = 1.5 s, T2 = 1 s, L = 1 s" in tune("direct-synthesis", third).notes[0]
     assert (
         "tangent to first order with K = 2, T = 20 s, L = 2.931 s"
-        in (tune("zn-step", SOPDT.of_time_constants(2.0, 10.0, 5.0, 1.0)).notes[0])
+        in (tune("zn-step", SOPDT(K=2.0, T1=10.0, T2=5.0, L=1.0)).notes[0])
     )
     lagged = tune("lambda", Integrating(0.1, 1.0, 1.0), lambda_s=6.0)
     assert lagged.gains == tune("lambda", Integrating(0.1, 2.0), lambda_s=6.0).gains

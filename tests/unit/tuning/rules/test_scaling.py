@@ -23,7 +23,7 @@ times = st.floats(0.1, 100.0)
 ratios = st.floats(0.1, 1.0)
 plants = st.one_of(
     st.builds(lambda K, T, r: FOPDT(K, T, r * T), gains, times, ratios),
-    st.builds(lambda K, T, a, r: SOPDT.of_time_constants(K, T, a * T, r * T), gains, times, ratios, ratios),
+    st.builds(lambda K, T, a, r: SOPDT(K=K, T1=T, T2=a * T, L=r * T), gains, times, ratios, ratios),
     st.builds(lambda K, T, zeta, r: SOPDT(K, T, zeta, r * T), gains, times, st.floats(0.3, 0.9), ratios),
     st.builds(lambda K, T, r: Integrating(K, r * T, T), gains, times, ratios),
     st.builds(lambda K, L: Integrating(K, L), gains, times),
@@ -109,7 +109,7 @@ def test_most_plants_are_taken() -> None:
     """The property above is worth something only if most methods answer on most kinds of plant."""
     kinds: list[Model] = [
         FOPDT(2.0, 10.0, 4.0),
-        SOPDT.of_time_constants(2.0, 10.0, 3.0, 1.0),
+        SOPDT(K=2.0, T1=10.0, T2=3.0, L=1.0),
         Integrating(0.1, 2.0),
         Integrating(0.1, 2.0, 1.0),
         TransferFunction((1.0,), (1.0, 3.0, 3.0, 1.0), 1.0),
