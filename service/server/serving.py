@@ -34,6 +34,7 @@ from loopwright.service.api.gate.connections import (
 )
 from loopwright.service.api.gate.gate import Policy, is_loopback
 from loopwright.service.api.gate.limits import RequestLimits
+from loopwright.service.api.services import Services
 from loopwright.service.execution.computing.limits import ComputationKind, ComputingLimits
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.execution.procedures import Tune, rehearse
@@ -270,9 +271,21 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         live_stream = Live(jobs, listening, alarms, others)
         streams_over = threading.Event()
         app = create_app(
-            jobs, policy, checks, pool, station.sdo_retries, listening, live_stream, figures, alarms, own, others,
-            streams_over.is_set,
-        )  # fmt: skip
+            Services(
+                jobs=jobs,
+                policy=policy,
+                checks=checks,
+                pool=pool,
+                sdo_retries=station.sdo_retries,
+                listening=listening,
+                live=live_stream,
+                figures=figures,
+                alarms=alarms,
+                own=own,
+                others=others,
+                streams_over=streams_over.is_set,
+            )
+        )
         config = server_config(app, setup, listener, descriptors)
         server = _Server(config, jobs, listening, live_stream, alarms, streams_over)
 

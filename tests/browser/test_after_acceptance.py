@@ -12,9 +12,9 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from loopwright.plantsim.catalogue import LaterPath
-from loopwright.service.api.app import create_app
 from tests.browser import person
 from tests.browser.person import NAME
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
 from tests.unit.service.jobs.watched import PU, WatchedLoop
 from tests.unit.service.served import served
@@ -32,7 +32,7 @@ class SimulatedSite:
 def site(tmp_path: Path) -> Iterator[SimulatedSite]:
     service = Service(tmp_path)
     loop = WatchedLoop(service, second_path=LaterPath(0.43, 4.0 * PU))
-    with served(create_app(service.jobs)) as server:
+    with served(app_of(service.jobs)) as server:
         yield SimulatedSite(f"http://127.0.0.1:{server.port}", loop)
     service.close()
 

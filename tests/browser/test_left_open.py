@@ -15,7 +15,6 @@ import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 from sqlalchemy import delete
 
-from loopwright.service.api.app import create_app
 from loopwright.service.inputs.config import parse_site
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.live.jobs import LookedUpJobs
@@ -25,6 +24,7 @@ from loopwright.tuning.reasons import Failed, Reason
 from tests.browser import person
 from tests.browser.pages import Pages
 from tests.browser.test_clock import HIDE
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import TAG, FakeLoop, Service, loop_entry
 from tests.unit.service.processes import until
 from tests.unit.service.served import served
@@ -50,7 +50,7 @@ class SimulatedSite:
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[SimulatedSite]:
     service = Service(tmp_path)
-    with served(create_app(service.jobs)) as server:
+    with served(app_of(service.jobs)) as server:
         yield SimulatedSite(f"http://127.0.0.1:{server.port}", service)
     service.close()
 
@@ -239,7 +239,7 @@ class TestManyLoops:
 class TestStream:
     def test_a_service_that_comes_back_with_other_limits(self, tmp_path: Path, browser: Browser) -> None:
         service = Service(tmp_path)
-        with served(create_app(service.jobs)) as server:
+        with served(app_of(service.jobs)) as server:
             pages = Pages(browser, f"http://127.0.0.1:{server.port}")
             page = pages.open(LOOP)
             settings = page.get_by_role("region", name="Gains and limits")
@@ -248,7 +248,7 @@ class TestStream:
         entries = [loop_entry(pv_limits={"low": 10.0, "high": 77.0}), loop_entry(tag=OTHER, channel=2)]
         service.loops = parse_site({"loops": entries}, "test").loops
         jobs = service.more_jobs(lambda config: FakeLoop(service.controller))
-        with served(create_app(jobs), port=server.port):
+        with served(app_of(jobs), port=server.port):
             expect(settings).to_contain_text("10.00 … 77.00")
             pages.close()
         jobs.stop()
@@ -256,14 +256,14 @@ class TestStream:
 
     def test_a_service_that_comes_back_without_the_loop(self, tmp_path: Path, browser: Browser) -> None:
         service = Service(tmp_path)
-        with served(create_app(service.jobs)) as server:
+        with served(app_of(service.jobs)) as server:
             pages = Pages(browser, f"http://127.0.0.1:{server.port}")
             page = pages.open(f"/ui/loops/{OTHER}")
             expect(page.get_by_role("heading", name=OTHER)).to_be_visible()
         service.jobs.stop()
         service.loops = parse_site({"loops": [loop_entry()]}, "test").loops
         jobs = service.more_jobs(lambda config: FakeLoop(service.controller))
-        with served(create_app(jobs), port=server.port):
+        with served(app_of(jobs), port=server.port):
             expect(page.get_by_role("main")).to_contain_text(f"There is no loop {OTHER} here.")
             expect(page.locator(".banner[role=alert]")).not_to_be_attached()
             pages.close()

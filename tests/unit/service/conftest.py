@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.service.api.app import create_app
 from loopwright.service.security.principal import SERVICE, current
 from loopwright.service.store.store import Store
 from loopwright.service.telemetry import logs
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import Service
 from tests.unit.service.postgres import Server, binaries
 
@@ -49,7 +49,7 @@ def service(tmp_path: Path) -> Iterator[Service]:
 
 @pytest.fixture
 def client(service: Service) -> Iterator[TestClient]:
-    with TestClient(create_app(service.jobs), raise_server_exceptions=False) as client:
+    with TestClient(app_of(service.jobs), raise_server_exceptions=False) as client:
         yield client
 
 
@@ -64,7 +64,7 @@ def shared_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service
 @pytest.fixture(scope="module")
 def shared_client(shared_service: Service) -> Iterator[TestClient]:
     """Its client, for requests that are refused or read only: to make an application takes 0.1 s of processor time."""
-    with TestClient(create_app(shared_service.jobs), raise_server_exceptions=False) as client:
+    with TestClient(app_of(shared_service.jobs), raise_server_exceptions=False) as client:
         yield client
 
 

@@ -15,7 +15,6 @@ from sqlalchemy import text
 
 from loopwright.service.alarms.alarm import Alarm
 from loopwright.service.alarms.watch import AlarmWatch
-from loopwright.service.api.app import create_app
 from loopwright.service.inputs.config import parse_site
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.jobs.machine import Machine
@@ -28,6 +27,7 @@ from loopwright.service.live.own_gateway import Announcing, OwnGateway
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.gateways import NOW_S
 from loopwright.service.store.store import Store
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import FakeController, FakeLoop, FakeTune, ThreadEngine, fake_rehearse, loop_entry
 from tests.unit.service.processes import until
 
@@ -76,7 +76,7 @@ class OneGateway:
         self.watch = AlarmWatch(self.jobs, self.listening, self.others, lambda: time.time() + self.alarms_later_s)
         self.own = OwnGateway(self.jobs, self.listening, f"https://{name}.example", self.watch)
         self.announcing = Announcing(self.jobs, self.own)
-        self.app = create_app(
+        self.app = app_of(
             self.jobs, checks={}, listening=self.listening, alarms=self.watch, own=self.own, others=self.others
         )
         self.http = TestClient(self.app, raise_server_exceptions=False)

@@ -16,7 +16,6 @@ from typer.testing import CliRunner
 
 from loopwright.service.alarms.alarm import Alarm, AlarmKind
 from loopwright.service.alarms.watch import AlarmWatch, NoSuchAlarm
-from loopwright.service.api.app import create_app
 from loopwright.service.api.metrics import exposition, registry
 from loopwright.service.cli import main as cli
 from loopwright.service.cli.client import Client
@@ -33,6 +32,7 @@ from loopwright.service.store.tables import LoopRow
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.api.test_api import assert_problem
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import OLD, TAG, FakeController, Service
 from tests.unit.service.postgres import Server
 from tests.unit.service.processes import until
@@ -378,7 +378,7 @@ def test_an_alarm_whose_cause_lasts_is_not_signed_off(service: Service) -> None:
     watched.after(0.0)
     watched.after(3.0)
     (alarm,) = watched.watch.look()
-    with TestClient(create_app(service.jobs, listening=watched.ear, alarms=watched.watch)) as client:
+    with TestClient(app_of(service.jobs, listening=watched.ear, alarms=watched.watch)) as client:
         detail = assert_problem(client.post(f"/alarms/{alarm.id}/sign-off", json={"by": "me"}), 409)["detail"]
         assert detail == (
             "an alarm of level 2 is not signed off: it goes by itself 3 s after its cause has gone. "

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.places import Full, Places, stops_a_test
 from loopwright.service.security.keys import Scope, new_key
@@ -23,6 +22,7 @@ from loopwright.service.store.keyring import ABORTS_FOR_S, REVOKED_WITHIN_S, Key
 from loopwright.service.store.tables import AuditRow
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.api.test_api import assert_problem
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import TAG, Service, away
 from tests.unit.service.processes import PATIENCE_S, until
 
@@ -145,7 +145,7 @@ class Door:
         self.sessions = BrowserSessions(lambda: self.now)
         policy = Policy(self.keyring, sessions=self.sessions)
         self.client = TestClient(
-            create_app(service.jobs, policy, {}), base_url="http://plant.example", raise_server_exceptions=False
+            app_of(service.jobs, policy, {}), base_url="http://plant.example", raise_server_exceptions=False
         )
         self.signed_in = signed_in
 

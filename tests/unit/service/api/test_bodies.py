@@ -10,7 +10,6 @@ import pytest
 from fastapi.routing import APIRoute
 from fastapi.testclient import TestClient
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.gate.bodies import SMALL
 from loopwright.service.api.gate.gate import Policy
@@ -20,6 +19,7 @@ from loopwright.service.security.keys import Scope
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import TAG, FakeController, FakeLoop, FakeTune, Service, ThreadEngine, fake_rehearse
 from tests.unit.service.postgres import Server
 
@@ -37,7 +37,7 @@ def refused(client: TestClient, url: str, body: str | bytes, **headers: str) -> 
 
 
 def test_every_route_with_a_body_reads_it_strictly(service: Service) -> None:
-    app = create_app(service.jobs)
+    app = app_of(service.jobs)
     found = [route for route in app.routes if isinstance(route, APIRoute) and route.body_field]
     assert all(isinstance(route, JsonRoute) for route in found)
     documented = {
@@ -128,7 +128,7 @@ def test_text_that_no_database_keeps(path: str, tmp_path: Path, postgres: Server
     try:
         open_loop = lambda config: FakeLoop(FakeController())  # noqa: E731
         jobs = make_jobs({}, store, open_loop, FakeTune(), fake_rehearse, engine=ThreadEngine())
-        client = TestClient(create_app(jobs, checks={}), raise_server_exceptions=False)
+        client = TestClient(app_of(jobs, checks={}), raise_server_exceptions=False)
         answer = client.get(path)
         assert answer.status_code == 422 and "NUL" in answer.json()["detail"], answer.text
     finally:
@@ -191,7 +191,7 @@ def test_a_test_is_signed_where_no_key_names_the_caller(
 def test_the_key_names_who_does_not_say_it(service: Service) -> None:
     keyring = Keyring(service.store.engine)
     _, key = keyring.create("control room", Scope.OPERATE)
-    client = TestClient(create_app(service.jobs, Policy(keyring)), headers={"Authorization": f"Bearer {key}"})
+    client = TestClient(app_of(service.jobs, Policy(keyring)), headers={"Authorization": f"Bearer {key}"})
     job = client.post(POSTS[0], json={}).json()
     assert job["requested_by"] == "control room"
     assert client.post(POSTS[0]).status_code == 422, "a body it needs all the same"

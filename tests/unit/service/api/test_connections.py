@@ -14,7 +14,6 @@ from typing import Any
 
 import pytest
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.gate import key_checks
 from loopwright.service.api.gate.connections import Connections, OnceAMinute, WarningOnceAMinute
 from loopwright.service.api.gate.gate import Policy
@@ -27,6 +26,7 @@ from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.telemetry.metrics import REQUESTS
 from loopwright.tuning.reasons import Failed, Reason
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import TAG, FakeLoop, Service
 from tests.unit.service.processes import until
 from tests.unit.service.served import PATIENCE_S, Served, rest, served
@@ -44,7 +44,7 @@ def stack() -> Iterator[ExitStack]:
 
 def open_door(stack: ExitStack, service: Service, keyring: Keyring | None = None, **limits: Any) -> Served:
     allowed = RequestLimits(**limits)
-    app = create_app(service.jobs, Policy(keyring, allowed, local_only=True), {})
+    app = app_of(service.jobs, Policy(keyring, allowed, local_only=True), {})
     return stack.enter_context(served(app, limits=allowed))
 
 
@@ -453,7 +453,7 @@ def test_one_line_a_minute(caplog: pytest.LogCaptureFixture) -> None:
 def test_who_asks_is_believed_of_trusted_proxies_only(
     service: Service, stack: ExitStack, trusted: tuple[str, ...], address: str
 ) -> None:
-    app = create_app(service.jobs, Policy(local_only=True), {})
+    app = app_of(service.jobs, Policy(local_only=True), {})
     door = stack.enter_context(served(app, trusted_proxies=tuple(map(ip_network, trusted))))
     forwarded = {"X_Forwarded_For": "198.51.100.1, 203.0.113.9", "X_Forwarded_Proto": "https"}
     assert door.ask("POST", f"/loops/{TAG}/retune", '{"requested_by": "me"}', **forwarded)[0] == 202

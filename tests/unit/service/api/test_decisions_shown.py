@@ -9,20 +9,20 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.security.keys import Scope
 from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.keyring import Keyring
 from loopwright.tuning.gains import Gains
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import NEW, OLD, TAG, FakeLoop, Service
 from tests.unit.service.processes import until
 
 
 @pytest.fixture
 def client(service: Service) -> Iterator[TestClient]:
-    with TestClient(create_app(service.jobs)) as client:
+    with TestClient(app_of(service.jobs)) as client:
         yield client
 
 
@@ -116,7 +116,7 @@ def test_a_key_that_reads_sees_names_and_no_addresses(service: Service) -> None:
     proposed(service, "A. Lind")
     keyring = Keyring(service.store.engine)
     _, key = keyring.create("supervisor", Scope.READ)
-    with TestClient(create_app(service.jobs, Policy(keyring))) as client:
+    with TestClient(app_of(service.jobs, Policy(keyring))) as client:
         assert client.get("/decisions").status_code == 401
         answer = client.get("/decisions", headers={"Authorization": f"Bearer {key}"})
         assert answer.status_code == 200 and len(answer.json()) == 1

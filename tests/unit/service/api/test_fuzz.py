@@ -23,7 +23,6 @@ from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.limits import RequestLimits
 from loopwright.service.inputs.request import FastRetune
@@ -32,6 +31,7 @@ from loopwright.service.live.live import Live
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
 from loopwright.tuning.reasons import Failed, Reason
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import TAG, Service
 
 with warnings.catch_warnings():
@@ -97,7 +97,7 @@ class Site:
         listening = Listening(self.service.jobs.directory.loops, self.service.store, on=False)
         live = Live(self.service.jobs, listening)
         live.close()  # its streams, which would never end, end after their first messages
-        app = create_app(self.service.jobs, policy, listening=listening, live=live)
+        app = app_of(self.service.jobs, policy, listening=listening, live=live)
         self.client = TestClient(app, raise_server_exceptions=False)
         self._open = ExitStack()
         # One event loop for all cases: the client would make one, in a thread of its own, for each.

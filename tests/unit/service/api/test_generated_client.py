@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.execution.procedures import rehearse
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import FakeLoop, Service
 from tests.unit.service.served import served
 
@@ -112,7 +112,7 @@ def test_a_script_on_the_generated_client(service: Service, folder: Path) -> Non
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
     keyring = Keyring(service.store.engine)
     _, key = keyring.create("script", Scope.OPERATE)
-    app = create_app(jobs, Policy(keyring))
+    app = app_of(jobs, Policy(keyring))
 
     (folder / "openapi.json").write_text(json.dumps(app.openapi()))
     (folder / "generator.yaml").write_text("post_hooks: []\n")

@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.limits import RequestLimits
 from loopwright.service.inputs.request import FastRetune
@@ -28,6 +27,7 @@ from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.api.test_api import GOLDEN, assert_problem
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import NEW, TAG, Service, away, held_acceptances
 from tests.unit.service.postgres import Server
 from tests.unit.service.processes import until
@@ -135,7 +135,7 @@ def done(service: Service) -> tuple[int, int, int]:
     """Jobs, retunes of many and entries of the audit log."""
     return (
         len(service.store.recent()),
-        len(TestClient(create_app(service.jobs, checks={})).get("/retunes").json()),
+        len(TestClient(app_of(service.jobs, checks={})).get("/retunes").json()),
         len(audit.trail(service.store.engine, 1000)),
     )
 
@@ -250,7 +250,7 @@ def test_many_at_the_same_time_make_one_job(service: Service, client: TestClient
 
 def test_keys_are_of_who_asks(service: Service) -> None:
     keyring = Keyring(service.store.engine)
-    client = TestClient(create_app(service.jobs, Policy(keyring), {}), raise_server_exceptions=False)
+    client = TestClient(app_of(service.jobs, Policy(keyring), {}), raise_server_exceptions=False)
     for name, tag in (("a", TAG), ("b", "FIC-2")):
         key = keyring.create(name, Scope.OPERATE)[1]
         assert post(client, f"/loops/{tag}/retune", Authorization=f"Bearer {key}").status_code == 202
@@ -309,7 +309,7 @@ def test_an_error_after_the_job_was_made_does_not_make_another(
 
 def test_a_body_that_is_too_long_is_refused_with_a_key_too(service: Service) -> None:
     limits = RequestLimits(body_bytes=1000)
-    client = TestClient(create_app(service.jobs, Policy(None, limits), {}), raise_server_exceptions=False)
+    client = TestClient(app_of(service.jobs, Policy(None, limits), {}), raise_server_exceptions=False)
     for content in (b" " * 2000, iter([b" " * 600, b" " * 600])):
         assert_problem(client.post(RETUNE, content=content, headers=KEY), 413)
 
@@ -345,7 +345,7 @@ def killed(*_: Any) -> None:
 
 
 def next_start(service: Service) -> TestClient:
-    return TestClient(create_app(service.jobs, checks={}), raise_server_exceptions=False)
+    return TestClient(app_of(service.jobs, checks={}), raise_server_exceptions=False)
 
 
 MADE: dict[Asked, int] = {
@@ -389,7 +389,7 @@ def test_answers_outlive_the_service(tmp_path: Path) -> None:
     answers = []
     for _ in range(2):
         service = Service(tmp_path)
-        with TestClient(create_app(service.jobs)) as client:
+        with TestClient(app_of(service.jobs)) as client:
             answers.append(post(client, RETUNE))
             service.wait(answers[0].json()["id"])
         service.close()

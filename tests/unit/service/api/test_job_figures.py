@@ -22,7 +22,6 @@ from benchmarks.rehearsed import MIDDLE, TS, entry
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.service.api.app import create_app
 from loopwright.service.api.report.paper import paper
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NotWanted, Pool
@@ -43,6 +42,7 @@ from loopwright.tuning.models import FOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.api.test_api import assert_problem, finished, start
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import Service, ThreadEngine
 from tests.unit.service.processes import until
 
@@ -90,7 +90,7 @@ class Here:
         return row.id
 
     def client(self) -> TestClient:
-        return TestClient(create_app(self.jobs, pool=self.pool, figures=self.figures), raise_server_exceptions=False)
+        return TestClient(app_of(self.jobs, pool=self.pool, figures=self.figures), raise_server_exceptions=False)
 
 
 class Offset:
@@ -309,7 +309,7 @@ def test_who_waits_as_the_service_is_to_end_gets_an_answer(
     monkeypatch.setattr("loopwright.service.jobs.kept_figures.VERSION", job_figures.VERSION + 4)
     pool = Endless()
     figures = KeptFigures(here.store, pool)
-    app = create_app(here.jobs, pool=pool, figures=figures)
+    app = app_of(here.jobs, pool=pool, figures=figures)
     with TestClient(app) as client, ThreadPoolExecutor(2) as askers:
         asked = [askers.submit(client.get, f"/jobs/{job}/{what}") for what in ("record", "designs")]
         assert pool.begun.wait(60.0)

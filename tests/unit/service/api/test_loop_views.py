@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from loopwright.service.api.app import create_app
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.listening.listening import Listening
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.gains import Gains
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
 from tests.unit.service.processes import until
 
@@ -25,7 +25,7 @@ def listening(service: Service) -> Listening:
 
 @pytest.fixture
 def client(service: Service, listening: Listening) -> Iterator[TestClient]:
-    with TestClient(create_app(service.jobs, listening=listening)) as client:
+    with TestClient(app_of(service.jobs, listening=listening)) as client:
         yield client
 
 

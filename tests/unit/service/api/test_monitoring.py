@@ -18,8 +18,8 @@ import yaml
 from fastapi.testclient import TestClient
 from grafana_foundation_sdk.models.dashboard import Dashboard
 
-from loopwright.service.api.app import create_app
 from tests.ports import free_port
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import Service
 from tests.unit.service.processes import until
 from tests.unit.service.served import served
@@ -64,7 +64,7 @@ def test_every_alert_says_what_to_do() -> None:
 @pytest.fixture
 def prometheus(service: Service, tmp_path: Path) -> Iterator[httpx.Client]:
     """Prometheus that scrapes the service each second, with the alert rules."""
-    with ExitStack() as stack, served(create_app(service.jobs)) as server:
+    with ExitStack() as stack, served(app_of(service.jobs)) as server:
         shutil.copy(FOLDER / "alerts.yml", tmp_path)
         config = {
             "global": {"scrape_interval": "1s", "evaluation_interval": "1s"},

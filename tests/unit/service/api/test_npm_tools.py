@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.execution.procedures import rehearse
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
 from tests.unit.service.api.test_api import GOLDEN
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import FakeLoop, Service
 from tests.unit.service.served import served
 
@@ -72,7 +72,7 @@ def test_a_typescript_client_compiles_and_retunes_a_loop(service: Service, folde
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
     keyring = Keyring(service.store.engine)
     _, key = keyring.create("script", Scope.OPERATE)
-    with served(create_app(jobs, Policy(keyring))) as server:
+    with served(app_of(jobs, Policy(keyring))) as server:
         ended = run("node", "out/retune.js", f"http://127.0.0.1:{server.port}", key, folder=folder)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     fast, simc = (line.split() for line in ended.stdout.splitlines())

@@ -14,7 +14,6 @@ from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 from typer.testing import CliRunner
 
-from loopwright.service.api.app import create_app
 from loopwright.service.cli import loops
 from loopwright.service.cli import main as cli
 from loopwright.service.inputs.request import FastRetune
@@ -30,6 +29,7 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.api.test_api import assert_problem, start
+from tests.unit.service.apps import app_of
 from tests.unit.service.cli.test_cli_jobs import Through
 from tests.unit.service.fakes import TAG, Service
 from tests.unit.service.observing.findings import finding, gains
@@ -48,7 +48,7 @@ def store_findings(service: Service) -> Callable[[], int]:
 @contextmanager
 def asked(service: Service, rings: Rings, not_heard: str | None = None) -> Iterator[TestClient]:
     service.controller.state = replace(service.controller.state, gains=LOOP.gains, sample_time_s=LOOP.Ts)
-    app = create_app(service.jobs, listening=HeardBefore(rings, not_heard))
+    app = app_of(service.jobs, listening=HeardBefore(rings, not_heard))
     with TestClient(app, raise_server_exceptions=False) as client:
         yield client
 

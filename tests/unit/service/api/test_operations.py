@@ -19,7 +19,6 @@ from sqlalchemy.exc import OperationalError
 from loopwright.protocol.station import Station
 from loopwright.protocol.tuner import FailureKind, Tuner, TunerError
 from loopwright.service.api import operations
-from loopwright.service.api.app import create_app
 from loopwright.service.api.operations import Readiness
 from loopwright.service.inputs.config import parse_site
 from loopwright.service.loops.bus_watch import BusWatch
@@ -29,6 +28,7 @@ from loopwright.service.telemetry.logs import JsonLines, about
 from loopwright.service.telemetry.metrics import SAMPLES_LOST
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.api.test_api import finished, start
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import TAG, FakeLoop, Service, loop_entry
 from tests.unit.service.processes import until
 
@@ -38,7 +38,7 @@ def test_alive(client: TestClient) -> None:
 
 
 def ready(service: Service, **checks: Any) -> tuple[int, dict[str, Any]]:
-    with TestClient(create_app(service.jobs, checks=checks or None)) as client:
+    with TestClient(app_of(service.jobs, checks=checks or None)) as client:
         answer = client.get("/readyz")
         return answer.status_code, answer.json()
 
@@ -66,7 +66,7 @@ def test_what_is_worth_knowing_of_a_part_that_is_ready(service: Service) -> None
 
 
 def test_a_service_that_stops_is_not_ready_but_alive(service: Service) -> None:
-    client = TestClient(create_app(service.jobs))
+    client = TestClient(app_of(service.jobs))
     service.jobs.request_stop()
     assert client.get("/healthz").status_code == 200
     body = client.get("/readyz")
@@ -74,7 +74,7 @@ def test_a_service_that_stops_is_not_ready_but_alive(service: Service) -> None:
 
 
 def test_a_database_that_is_gone_is_named(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
-    client = TestClient(create_app(service.jobs))
+    client = TestClient(app_of(service.jobs))
 
     def gone() -> None:
         raise OSError("server closed the connection")
@@ -168,7 +168,7 @@ def test_samples_lost_are_counted_from_0_on(service: Service) -> None:
     """Prometheus sees no increase in a counter that begins with the first loss."""
     service.loops = parse_site({"loops": [loop_entry(bus="virtual:untouched")]}, "test").loops
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller))
-    found = samples(TestClient(create_app(jobs)))
+    found = samples(TestClient(app_of(jobs)))
     assert found["loopwright_samples_lost_total", (("bus", "virtual:untouched"),)] == 0
     jobs.stop()
 
@@ -211,7 +211,7 @@ def test_stages_requests_and_samples_are_counted(service: Service, client: TestC
 
 def test_the_retries_of_the_station_are_shown(service: Service) -> None:
     station = Station()
-    client = TestClient(create_app(service.jobs, checks={}, sdo_retries=station.sdo_retries))
+    client = TestClient(app_of(service.jobs, checks={}, sdo_retries=station.sdo_retries))
     shown = ("loopwright_sdo_retries_total", (("bus", "virtual:test"),))
     assert shown not in samples(client)
     station.sdo_retries["virtual:test"] += 2

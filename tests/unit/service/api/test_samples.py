@@ -21,7 +21,6 @@ from hypothesis import strategies as st
 from sqlalchemy import delete
 from sqlalchemy.pool import QueuePool
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.samples import Gone, Reading, csv_text, json_text, parts
 from loopwright.service.api.web.compressed import takes_gzip
 from loopwright.service.jobs.stored_record import record_columns
@@ -29,6 +28,7 @@ from loopwright.service.store import sample_blocks
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import ChunkRow
 from loopwright.tuning.plan import Sample
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import TAG, Service, add_samples
 
 TS = 0.1
@@ -172,7 +172,7 @@ def test_nothing_of_a_download_is_done_in_the_event_loop(
     monkeypatch.setattr(sample_blocks.Block, "texts", watched)
 
     async def download() -> int:
-        transport = httpx.ASGITransport(create_app(service.jobs))
+        transport = httpx.ASGITransport(app_of(service.jobs))
         async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
             return len((await client.get(f"/jobs/{job}/samples{query}")).content)
 

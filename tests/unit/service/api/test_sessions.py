@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.limits import RequestLimits
 from loopwright.service.live import live as live_module
@@ -19,6 +18,7 @@ from loopwright.service.security.sessions import IDLE_S, LASTS_S, BrowserSession
 from loopwright.service.store import audit
 from loopwright.service.store.keyring import REVOKED_WITHIN_S, Keyring
 from tests.unit.service.api.test_api import assert_problem
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import TAG, Service
 from tests.unit.service.live.test_live_stream import screens_of
 from tests.unit.service.live_viewer import viewing
@@ -39,7 +39,7 @@ class Browsers:
 
     def browser(self, scheme: str = "http", **limits: Any) -> TestClient:
         policy = Policy(self.keyring, RequestLimits(**limits), sessions=self.sessions)
-        app = create_app(self.service.jobs, policy, {})
+        app = app_of(self.service.jobs, policy, {})
         self._clients.append(TestClient(app, base_url=f"{scheme}://{HOST}", raise_server_exceptions=False))
         return self._clients[-1]
 

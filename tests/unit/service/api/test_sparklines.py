@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 from fastapi.testclient import TestClient
 
-from loopwright.service.api.app import create_app
 from loopwright.service.listening.bins import GAP_BEFORE, Rows
 from loopwright.service.listening.listening import Listening
 from loopwright.service.listening.rings import Rings
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import TAG, Service
 
 T0 = 1_769_860_800.0
@@ -25,7 +25,7 @@ def test_a_gap_is_an_entry_of_nulls(service: Service, monkeypatch: pytest.Monkey
         return rings.rows(T0, T0 + 60.0, points) if tag == TAG else Rows()
 
     monkeypatch.setattr(listening, "memory", memory)
-    with TestClient(create_app(service.jobs, listening=listening)) as client:
+    with TestClient(app_of(service.jobs, listening=listening)) as client:
         found = client.get("/history", params={"seconds": 60, "points": 100}).json()
         assert [loop for loop in found["loops"] if loop["tag"] == TAG] == [
             {

@@ -18,7 +18,6 @@ from loopwright.containers import keeper
 from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.catalogue import find
-from loopwright.service.api.app import create_app
 from loopwright.service.api.job_views import JobView
 from loopwright.service.cli import demo, demo_live, job_tables, terminal
 from loopwright.service.cli import main as cli
@@ -30,6 +29,7 @@ from loopwright.service.inputs.config import parse_site
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.plan import Mode
+from tests.unit.service.apps import app_of
 from tests.unit.service.cli.test_cli_jobs import Through, run
 from tests.unit.service.fakes import TAG, Service, ThreadEngine, fake_rehearse
 
@@ -52,7 +52,7 @@ def in_memory(tmp_path: Path) -> Iterator[Through]:
     store = Store(tmp_path)
     jobs = make_jobs(loops, store, lambda config: loop, tune, fake_rehearse, engine=ThreadEngine())
     jobs.boot()
-    with TestClient(create_app(jobs)) as http:
+    with TestClient(app_of(jobs)) as http:
         yield Through(http)
     jobs.stop()
     store.close()

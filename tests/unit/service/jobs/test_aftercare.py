@@ -13,7 +13,6 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.metrics import exposition, registry
 from loopwright.service.cli import main as cli
 from loopwright.service.cli.client import Client
@@ -28,6 +27,7 @@ from loopwright.service.store.store import Store
 from loopwright.service.store.tables import LoopRow
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Reason
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import TAG, FakeController, Service, loop_entry
 from tests.unit.service.postgres import Server
 
@@ -235,7 +235,7 @@ def test_it_moves_with_its_loop_to_another_host(tmp_path: Path, postgres: Server
 
 @pytest.fixture
 def client(service: Service) -> Iterator[TestClient]:
-    with TestClient(create_app(service.jobs, checks={}), raise_server_exceptions=False) as client:
+    with TestClient(app_of(service.jobs, checks={}), raise_server_exceptions=False) as client:
         yield client
 
 

@@ -13,7 +13,6 @@ from pydantic import ValidationError
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
-from loopwright.service.api.app import create_app
 from loopwright.service.cli.client import Client
 from loopwright.service.inputs.config import BusConfig, parse_site
 from loopwright.service.inputs.request import FastRetune, retune_request
@@ -27,6 +26,7 @@ from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import RetuneRow
 from loopwright.tuning.reasons import Aborted, Failed, Reason, Refused
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import (
     FakeController,
     FakeLoop,
@@ -464,7 +464,7 @@ def test_loops_of_another_host_are_begun_there_and_any_host_may_abort(tmp_path: 
 # over HTTP
 @pytest.fixture
 def client(plant: Plant) -> Iterator[TestClient]:
-    with TestClient(create_app(plant.jobs), raise_server_exceptions=False) as client:
+    with TestClient(app_of(plant.jobs), raise_server_exceptions=False) as client:
         yield client
 
 

@@ -16,7 +16,6 @@ from rich.console import Console
 from sqlalchemy.orm import Session
 from typer.testing import CliRunner
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.cli import main as cli
 from loopwright.service.cli import terminal
@@ -36,6 +35,7 @@ from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Busy, Store
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.api.test_api import assert_problem
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import (
     NEW,
     OLD,
@@ -298,7 +298,7 @@ def test_from_another_gateway(tmp_path: Path, postgres: Server) -> None:
     with pytest.raises(Locked, match="gateway B"):
         here.start(TAG, FastRetune())
     for jobs in (here, there):
-        client = TestClient(create_app(jobs, checks={}))
+        client = TestClient(app_of(jobs, checks={}))
         assert {x["tag"]: x["locked"] and x["locked"]["by"] for x in client.get("/loops").json()} == {
             TAG: "gateway B", "FIC-2": None,
         }  # fmt: skip
@@ -440,7 +440,7 @@ def test_the_table_of_loops_shows_it(run: Any, monkeypatch: pytest.MonkeyPatch) 
 
 def test_who_may_only_look_may_not_lock(service: Service) -> None:
     keyring = Keyring(service.store.engine)
-    client = TestClient(create_app(service.jobs, Policy(keyring), {}))
+    client = TestClient(app_of(service.jobs, Policy(keyring), {}))
     for scope, status in ((Scope.READ, 403), (Scope.OPERATE, 200)):
         headers = {"Authorization": f"Bearer {keyring.create(scope.value, scope)[1]}"}
         for path in ("lock", "unlock"):

@@ -343,15 +343,15 @@ def test_a_name_that_another_service_has_taken_is_not_written_to(fleet: TwoGatew
 
 
 def test_a_file_is_not_written_to_once_a_second_and_there_is_one_gateway(service: Service) -> None:
-    from loopwright.service.api.app import create_app
     from loopwright.service.listening.listening import Listening
+    from tests.unit.service.apps import app_of
 
     listening = Listening(service.jobs.directory.loops, service.store, on=False)
     announcing = Announcing(service.jobs, OwnGateway(service.jobs, listening))
     announcing.start()
     assert not writing()
     announcing.close()
-    (only,) = TestClient(create_app(service.jobs, checks={})).get("/gateways").json()
+    (only,) = TestClient(app_of(service.jobs, checks={})).get("/gateways").json()
     assert (only["name"], only["here"], only["answers"], only["loops"], only["url"]) == ("local", True, True, 2, None)
 
 
@@ -367,9 +367,9 @@ def test_rows_of_gateways_without_loops_are_forgotten_after_30_days(fleet: TwoGa
 
 def test_the_stream_shows_rows_buses_and_progress_of_the_other_gateway(fleet: TwoGateways) -> None:
     live = Live(fleet.here.jobs, fleet.here.listening, others=fleet.here.others)
-    from loopwright.service.api.app import create_app
+    from tests.unit.service.apps import app_of
 
-    app = create_app(fleet.here.jobs, checks={}, listening=fleet.here.listening, live=live, others=fleet.here.others)
+    app = app_of(fleet.here.jobs, checks={}, listening=fleet.here.listening, live=live, others=fleet.here.others)
     fleet.there.tune.hold.clear()
     job = fleet.there.http.post(f"/loops/{TAG_THERE}/retune", json={"requested_by": "me"}).json()["url"]
     assert fleet.there.tune.inside.wait(20)

@@ -14,7 +14,6 @@ from sqlalchemy import event as database_event
 from sqlalchemy.exc import OperationalError
 
 from loopwright.service.alarms.watch import AlarmWatch
-from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.listening.bins import Rows
@@ -28,6 +27,7 @@ from loopwright.service.live.rows import loop_row
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
 from loopwright.tuning.reasons import Failed, Reason
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import TAG, Service
 from tests.unit.service.live_viewer import LiveViewer, viewing
 from tests.unit.service.processes import until
@@ -50,7 +50,7 @@ def screens_of(service: Service, policy: Policy | None = None) -> Iterator[Scree
     listening = Listening(service.jobs.directory.loops, service.store, on=False)
     alarms = AlarmWatch(service.jobs, listening)
     live = Live(service.jobs, listening, alarms)
-    with served(create_app(service.jobs, policy, listening=listening, live=live, alarms=alarms)) as door:
+    with served(app_of(service.jobs, policy, listening=listening, live=live, alarms=alarms)) as door:
         try:
             yield Screens(service, live, listening, alarms, door.port)
         finally:

@@ -16,10 +16,10 @@ from loopwright.plantsim.catalogue import find
 from loopwright.plantsim.device import PlantChannel, PlantDevice
 from loopwright.protocol.bus import open_bus
 from loopwright.protocol.station import Station
-from loopwright.service.api.app import create_app
 from loopwright.service.execution.procedures import tune
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.server.serving import open_bus_loop
+from tests.unit.service.apps import app_of
 from tests.unit.service.bus_site import FOUND
 from tests.unit.service.fakes import TAG, Service, ThreadEngine, fake_rehearse
 
@@ -70,7 +70,7 @@ def test_an_abort_does_not_wait_for_the_next_sample(service: Service) -> None:
         jobs = make_jobs(loops, service.store, open_loop, tune, fake_rehearse, engine=ThreadEngine())
         stack.callback(jobs.stop)
         jobs.boot()
-        client = TestClient(create_app(jobs, checks={}), base_url="http://127.0.0.1")
+        client = TestClient(app_of(jobs, checks={}), base_url="http://127.0.0.1")
         url = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()["url"]
         until(lambda: controller.sessions[0].is_open)
         until(lambda: client.get(url).json()["stage"] is not None)

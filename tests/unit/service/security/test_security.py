@@ -17,7 +17,6 @@ from sqlalchemy import update
 from sqlalchemy.exc import OperationalError
 from typer.testing import CliRunner
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy, is_loopback
 from loopwright.service.api.gate.limits import Buckets, RequestLimits
 from loopwright.service.cli import main as cli
@@ -31,6 +30,7 @@ from loopwright.service.store.tables import KeyRow
 from loopwright.service.telemetry.logs import JsonLines, Lines
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.api.test_api import assert_problem
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import NEW, OLD, TAG, Service
 from tests.unit.service.postgres import Server
 
@@ -48,7 +48,7 @@ def open_client(service: Service) -> Iterator[Open]:
 
     def make(keyring: Keyring | None = None, *, key: str | None = None, **limits: Any) -> TestClient:
         local = keyring is None
-        app = create_app(service.jobs, Policy(keyring, RequestLimits(**limits), local_only=local), {})
+        app = app_of(service.jobs, Policy(keyring, RequestLimits(**limits), local_only=local), {})
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         url = "http://127.0.0.1:8080" if local else "http://plant.example"
         clients.append(TestClient(app, base_url=url, headers=headers, raise_server_exceptions=False))
@@ -395,7 +395,7 @@ def test_keys_from_the_command_line(tmp_path: Path) -> None:
     assert run("key", "revoke", "shift", *data).exit_code == 2
     assert [k["valid"] for k in json.loads(run("key", "list", "--json", *data).stdout)] == [False, True]
     service = Service(tmp_path / "data")
-    rows = TestClient(create_app(service.jobs, checks={})).get("/audit").json()
+    rows = TestClient(app_of(service.jobs, checks={})).get("/audit").json()
     assert [row["what"] for row in rows] == ["key_revoke", "key_create", "key_create"]
     assert all(row["who"].startswith("cli:") for row in rows)
     service.close()

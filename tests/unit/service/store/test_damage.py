@@ -18,7 +18,6 @@ from sqlalchemy import event, text
 from typer.testing import CliRunner
 
 from loopwright.service.api import operations
-from loopwright.service.api.app import create_app
 from loopwright.service.cli import main as cli
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.jobs.dbos_engine import DurableEngine
@@ -28,6 +27,7 @@ from loopwright.service.store.database import ENGINE_FILE, FILE, BadDatabase
 from loopwright.service.store.journal_writes import event_of
 from loopwright.service.store.store import Store
 from loopwright.tuning.plan import Sample
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import OLD, TAG, Service, add_samples
 from tests.unit.service.processes import until
 
@@ -189,7 +189,7 @@ def test_a_job_that_only_the_engine_knows_is_said(service: Service, caplog: pyte
 
 @pytest.fixture
 def client(service: Service) -> Iterator[TestClient]:
-    with TestClient(create_app(service.jobs), raise_server_exceptions=False) as client:
+    with TestClient(app_of(service.jobs), raise_server_exceptions=False) as client:
         yield client
 
 

@@ -77,9 +77,9 @@ def test_every_request_that_is_refused_has_a_time_and_a_sentence(now: JobState, 
 def problem_of(service: Service, path: str) -> str:
     from fastapi.testclient import TestClient
 
-    from loopwright.service.api.app import create_app
+    from tests.unit.service.apps import app_of
 
-    answer = TestClient(create_app(service.jobs, checks={})).post(path, json={"requested_by": "me"})
+    answer = TestClient(app_of(service.jobs, checks={})).post(path, json={"requested_by": "me"})
     return str(assert_problem(answer, 409)["detail"])
 
 

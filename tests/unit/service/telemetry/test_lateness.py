@@ -10,8 +10,8 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from loopwright.service.api.app import create_app
 from loopwright.service.telemetry.lateness import EVERY_S, Lateness, watched_event_loop
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import Service
 
 HELD_S = 0.3
@@ -35,7 +35,7 @@ def test_it_is_told_once_a_minute_at_most() -> None:
 
 
 def test_a_handler_that_blocks_is_seen(service: Service, caplog: pytest.LogCaptureFixture) -> None:
-    app = create_app(service.jobs)
+    app = app_of(service.jobs)
 
     @app.get("/block")
     async def block() -> None:
@@ -64,7 +64,7 @@ def test_a_handler_that_blocks_is_seen(service: Service, caplog: pytest.LogCaptu
 
 
 def test_the_service_watches_its_own(service: Service) -> None:
-    app = create_app(service.jobs)
+    app = app_of(service.jobs)
 
     async def names() -> set[str]:
         async with app.router.lifespan_context(app):

@@ -13,12 +13,12 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 
-from loopwright.service.api.app import create_app
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.web.compressed import TEXTS, compressed
 from loopwright.service.api.web.pages import FILES
 from loopwright.service.security.keys import Scope
 from loopwright.service.store.keyring import Keyring
+from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import TAG, Service
 
 VENDOR = FILES / "vendor"
@@ -27,7 +27,7 @@ OURS = sorted(path for path in FILES.rglob("*") if path.is_file() and VENDOR not
 
 @pytest.fixture
 def client(service: Service) -> Iterator[TestClient]:
-    with TestClient(create_app(service.jobs)) as client:
+    with TestClient(app_of(service.jobs)) as client:
         yield client
 
 
@@ -124,7 +124,7 @@ def test_only_files_of_the_page_are_sent(client: TestClient, path: str) -> None:
 
 
 def test_where_keys_are_asked_for_the_page_comes_without_one(service: Service) -> None:
-    with TestClient(create_app(service.jobs, Policy(Keyring(service.store.engine)))) as client:
+    with TestClient(app_of(service.jobs, Policy(Keyring(service.store.engine)))) as client:
         for path in ("/", "/ui", "/ui/", f"/ui/loops/{TAG}", "/ui/js/main.js"):
             assert client.get(path).status_code == 200
         assert client.post("/ui/").status_code == 405
@@ -136,7 +136,7 @@ def test_the_page_learns_who_is_asking(service: Service, client: TestClient) -> 
     assert (found["name"], found["scope"], found["keys"], found["host"]) == ("local", "admin", False, "local")
     keyring = Keyring(service.store.engine)
     _, key = keyring.create("control room", Scope.OPERATE)
-    with TestClient(create_app(service.jobs, Policy(keyring))) as keyed:
+    with TestClient(app_of(service.jobs, Policy(keyring))) as keyed:
         assert keyed.get("/session").status_code == 401
         found = keyed.get("/session", headers={"Authorization": f"Bearer {key}"}).json()
         assert (found["name"], found["scope"], found["keys"]) == ("control room", "operate", True)
