@@ -90,23 +90,30 @@ def tunings(answer: TuningsView | AlternativesView, faceplate: Faceplate = ISA_I
 def _show_figures(tuned: Sequence[TunedView], faceplate: Faceplate, recommended: str | None) -> list[str]:
     """Shows the gains and figures of each method, and returns the names of the figures for which there is no place."""
     whole = console.options.update(width=_UNBOUNDED)
-    for count in range(len(_LEAST_NEEDED) + 1):
-        left_out = _LEAST_NEEDED[:count]
-        table = _table(tuned, faceplate, recommended, [each for each in _COLUMNS if each[0] not in left_out])
+    weights = any(each.gains is not None and each.gains.b != 1.0 for each in tuned)
+    places = [(_LEAST_NEEDED[:count], weights) for count in range(len(_LEAST_NEEDED) + 1)]
+    for left_out, weighted in [*places, (_LEAST_NEEDED, False)]:
+        shown = [each for each in _COLUMNS if each[0] not in left_out]
+        table = _table(tuned, faceplate, recommended, shown, weighted)
         if console.measure(table, options=whole).maximum <= console.width:
             break
     console.print(table)
-    return [heading.replace("-\n", "").replace("\n", " ").strip() for heading, *_ in _COLUMNS if heading in left_out]
+    return ["b"] * (weights and not weighted) + [
+        heading.replace("-\n", "").replace("\n", " ").strip() for heading, *_ in _COLUMNS if heading in left_out
+    ]
 
 
 def _table(
-    tuned: Sequence[TunedView], faceplate: Faceplate, recommended: str | None, shown: Sequence[tuple[str, str, str]]
+    tuned: Sequence[TunedView],
+    faceplate: Faceplate,
+    recommended: str | None,
+    shown: Sequence[tuple[str, str, str]],
+    weighted: bool,
 ) -> Table:
-    """The gains and figures of each method, with the units in the second line of the headings."""
+    """The gains and figures of each method, with the units in the second line of the headings. weighted: with b."""
     table = Table(Column("method", no_wrap=True), box=None, padding=(0, 0, 0, 1), pad_edge=False)
     for name, unit in faceplate.columns:
         table.add_column(f"{name}\n{unit}", justify="right", overflow="fold")
-    weighted = any(each.gains is not None and each.gains.b != 1.0 for each in tuned)
     for heading in (*["b"] * weighted, *(heading for heading, _, _ in shown)):
         table.add_column(heading, justify="right", overflow="fold")
     for each in tuned:
