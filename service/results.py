@@ -147,7 +147,7 @@ class TransferModelView(Figures):
     covariance: list[list[float]] | None = Field(
         default=None,
         description="Covariance of num, of den without its leading 1 and of the dead time, in this order; null: typed "
-        "in, or an earlier version has found it",
+        "in",
     )
 
     @property
@@ -206,7 +206,7 @@ class EvidenceView(Figures):
     longest_delay_seen_s: float | None = Field(
         default=None,
         description="How much later a second path of 30 % of MV's effect may act and still show in the record, s; "
-        "null: not known, of a job of an earlier version",
+        "null: not known",
         examples=[48.0],
     )
 
@@ -259,7 +259,7 @@ class StepPerformanceView(Figures):
     TV: float = Field(description="Total variation of MV. Set-point: percent per PV unit. Load: 1 at least")
     mv_peak: float | None = Field(
         default=None,
-        description="Largest change of MV. Set-point: percent per PV unit. null: an earlier version has computed it",
+        description="Largest change of MV. Set-point: percent per PV unit. null: not computed",
     )
 
 
@@ -273,8 +273,7 @@ class PerformanceView(Figures):
     PM_deg: float | None = Field(description="Phase margin, degrees; null: no crossing")
     delay_margin_s: float | None = Field(
         default=None,
-        description="Further dead time at which the loop becomes unstable, s; null: there is none, or an earlier "
-        "version has computed it",
+        description="Further dead time at which the loop becomes unstable, s; null: there is none",
     )
     noise_gain: float | None = Field(description="Immediate change of MV for a jump of PV, percent per PV unit")
     overshoot_pct: float | None = Field(description="Overshoot of a set-point step, percent")
@@ -434,14 +433,12 @@ class FastResult(_Result):
     )
     model_from: str | None = Field(
         default=None,
-        description="Where the model comes from, in words; null: there is none, or an earlier version has found it",
+        description="Where the model comes from, in words; null: there is none",
         examples=["3 set-point changes of normal operation, from which Ms is known to +-0.03, and the step under the "
                   "new gains"],
     )  # fmt: skip
     evidence: EvidenceView | None = Field(default=None, description="Evidence from the record")
-    known_before: KnownMsView | None = Field(
-        default=None, description="Ms of the old gains; null: there is no record, or an earlier version has found it"
-    )
+    known_before: KnownMsView | None = Field(default=None, description="Ms of the old gains; null: there is no record")
     verification: VerificationView | None = Field(default=None, description="Measured step that verifies the model")
 
 

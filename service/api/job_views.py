@@ -30,7 +30,7 @@ from loopwright.service.results import (
 )
 from loopwright.service.security.principal import signed
 from loopwright.service.states.acceptance_watch import AcceptanceWatch
-from loopwright.service.states.job_state import ACTIVE, JobState, shown
+from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.states.loop_state import LoopState, gains_of, same_gains
 from loopwright.service.store.clock import stamp
 from loopwright.tuning.gains import Gains
@@ -372,8 +372,7 @@ class JobView(BaseModel):
         description="The gains proposed or rehearsed, or of a job with no_gain those found no better"
     )
     comparison: ComparisonView | None = Field(
-        description="Comparison of the present and the new gains on the model; null: there are no new gains, or the "
-        "job ran under an earlier version"
+        description="Comparison of the present and the new gains on the model; null: there are no new gains"
     )
     rehearsed_on: RehearsedOnView | None = Field(
         description="The plant and the gains of a dry run; null: the job is no dry run"
@@ -384,8 +383,7 @@ class JobView(BaseModel):
         "not stable with them. `comparison` has more figures, for every method"
     )
     model_from: str | None = Field(
-        description="Where the model of method fast or setpoint comes from, in words; null: there is none, or an "
-        "earlier version has found it",
+        description="Where the model of method fast or setpoint comes from, in words; null: there is none",
         examples=["pulses of the set-point, and the set-point step under the new gains"],
     )
     evidence: EvidenceView | None = Field(description="Evidence from the record of method fast, also for a refused job")
@@ -416,8 +414,7 @@ class JobView(BaseModel):
     )
     watch: WatchView | None = Field(
         default=None,
-        description="The watch of the loop since the gains were accepted; null: they were not, or under an earlier "
-        "version",
+        description="The watch of the loop since the gains were accepted; null: they were not",
     )
     stopping: StoppingView | None = Field(description="The request to stop the job; null: there was none")
     sample_time_s: float | None = Field(
@@ -527,7 +524,7 @@ def job_view(
     elsewhere: how far the job has come on the gateway that runs it, where that is another one and has said so.
     has_record: whether its samples are stored.  watch: of the loop since its gains were accepted.
     """
-    state = shown(row.state, row.dry_run)
+    state = row.state
     later = latest is not None and latest.id != row.id and state is JobState.PROPOSED
     method = str(row.request.get("method", FIVE_STAGE))
     kept = _record(state, events, has_record)

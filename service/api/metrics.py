@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from loopwright.service.alarms.alarm import Level
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.states.job_state import ACTIVE, JobState, shown
+from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.store import looked_after
 from loopwright.service.store.live_jobs import latest_tests
 from loopwright.service.store.store import Store
@@ -76,14 +76,14 @@ class _OfTheStore(Collector):
         yield up
 
     def _jobs(self) -> Metric:
-        by = JobRow.state, JobRow.dry_run, JobRow.reason
+        by = JobRow.state, JobRow.reason
         with Session(self._store.engine) as session:
             own = JobRow.host == self._store.host  # gateways that share a database add up
             counts = session.execute(select(*by, func.count()).where(own).group_by(*by)).all()
         jobs = GaugeMetricFamily("loopwright_jobs", "Jobs of this gateway in the database", labels=["state", "reason"])
         found: Tally[tuple[str, str]] = Tally()
-        for state, dry_run, reason, count in counts:
-            found[shown(state, dry_run).value, reason or ""] += count
+        for state, reason, count in counts:
+            found[JobState(state).value, reason or ""] += count
         # Active states are always exported, because an alarm cannot use a gauge that vanishes.
         for key in sorted(found.keys() | {(state.value, "") for state in ACTIVE | {JobState.PROPOSED}}):
             jobs.add_metric(list(key), found.get(key, 0))

@@ -124,8 +124,8 @@ def _tuned(best: OptimalGains, spec: DesignSpec, assessed: Assessment) -> Method
 
 
 def asked_spec(row: Job, Ms: float) -> DesignSpec:
-    """Returns the specification that the job asked for, with another Ms; the defaults where a job of an older version
-    or of another method has asked for nothing. The settling time is left out: it is a way to choose an Ms."""
+    """Returns the specification that the job asked for, with another Ms; the defaults where a job of another method
+    has asked for nothing. The settling time is left out: it is a way to choose an Ms."""
 
     def number(name: str) -> float | None:
         value = row.request.get(name)

@@ -12,7 +12,7 @@ from loopwright.service.jobs.passing_on import PassingOn
 from loopwright.service.loops.gain_change import ForeignGains, replace_accepted
 from loopwright.service.observing.accepted_operation import watched
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
-from loopwright.service.states.job_state import JobState, shown
+from loopwright.service.states.job_state import JobState
 from loopwright.service.states.loop_state import LoopState, gains_of, same_gains, state_json
 from loopwright.service.store import loop_locks, watches
 from loopwright.service.store.decision_requests import What
@@ -94,7 +94,7 @@ class Decisions:
         row = self.store.get(job_id)
         with self._directory.alone_with(row.loop):
             row = self.store.get(job_id)
-            now = shown(row.state, row.dry_run)
+            now = row.state
             self.store.check_move(job_id, wanted)
             if (busy := self.store.why_busy(row.loop)) is not None:
                 raise busy

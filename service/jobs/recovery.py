@@ -45,8 +45,7 @@ class Recovery:
         if self.stopping():
             return
         safe: Restoration | None = None
-        # A job of an earlier version has no session, but may have touched its loop.
-        if row.found is not None and (row.session is not None or row.version != WORKFLOW_VERSION):
+        if row.found is not None and row.session is not None:
             safe = restore_loop_of(row, self.loops, self.open_loop)
             self.store.append(row.id, "loop_found", {"text": safe.text}, row.plant_time_s)
         columns: JobColumns = {}

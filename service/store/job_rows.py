@@ -9,7 +9,7 @@ from sqlalchemy import func, insert, select
 from sqlalchemy.orm import Session
 
 from loopwright.service.jsonable import JsonObject, json_object, to_jsonable
-from loopwright.service.states.job_state import ACTIVE, MOVES, JobState, shown
+from loopwright.service.states.job_state import ACTIVE, MOVES, JobState
 from loopwright.service.states.loop_state import gains_of, same_gains
 from loopwright.service.store import audit, claims, false_pv, late, loop_locks
 from loopwright.service.store.clock import now
@@ -56,7 +56,7 @@ def set_columns(row: JobRow, columns: JobColumns) -> None:
 
 def check(session: Session, row: JobRow, wanted: JobState) -> None:
     """Raises IllegalMove, with words for who asks for it, unless the job may become so."""
-    present = shown(row.state, row.dry_run)
+    present = row.state
     if wanted not in MOVES[present]:
         raise late.too_late(row, present, wanted, decided(session, row))
 

@@ -10,7 +10,7 @@ from enum import StrEnum
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from loopwright.service.states.job_state import ACTIVE, JobState, shown
+from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.store import audit, claims
 from loopwright.service.store.clock import now
 from loopwright.service.store.tables import JobRow, RetuneLoopRow, RetuneRow
@@ -133,7 +133,7 @@ def find(session: Session, retune_id: str, lock: bool = False) -> RetuneRow:
 def parts(session: Session, retune_id: str) -> list[Part]:
     """Its loops in order."""
     wanted = (
-        select(RetuneLoopRow, JobRow.state, JobRow.dry_run, JobRow.reason, JobRow.detail)
+        select(RetuneLoopRow, JobRow.state, JobRow.reason, JobRow.detail)
         .outerjoin(JobRow, JobRow.id == RetuneLoopRow.job_id)
         .where(RetuneLoopRow.retune_id == retune_id)
         .order_by(RetuneLoopRow.position)
@@ -143,12 +143,12 @@ def parts(session: Session, retune_id: str) -> list[Part]:
             row.position,
             row.loop,
             row.job_id,
-            shown(state, dry) if state else None,
+            JobState(state) if state else None,
             reason if row.detail is None else row.reason,
             detail if row.detail is None else row.detail,
             given_up=row.detail is not None,
         )
-        for row, state, dry, reason, detail in session.execute(wanted)
+        for row, state, reason, detail in session.execute(wanted)
     ]
 
 

@@ -6,8 +6,6 @@ import base64
 import hashlib
 import json
 import re
-import sqlite3
-from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -16,21 +14,16 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from loopwright.service.api.job_views import JobView, job_view
+from loopwright.service.api.job_views import JobView
 from loopwright.service.api.report import numbers
 from loopwright.service.api.report.drawing import around, ticks
 from loopwright.service.api.report.fingerprint import FIELDS
-from loopwright.service.api.report.paper import ReportSource, paper
 from loopwright.service.api.report.words import mark_names, stage_name
-from loopwright.service.jobs.job_figures import job_figures
 from loopwright.service.results import GainsView
-from loopwright.service.store.database import FILE
-from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import ADVICE, Failed, Reason, Refused
 from tests.unit.service import fakes
 from tests.unit.service.api.test_api import assert_problem, finished, start
 from tests.unit.service.fakes import NEW, OLD, RESULT, Service
-from tests.unit.service.store.test_results_migrated import GOLDEN, SQL
 
 MARKUP = "<script>alert(1)</script> & <!-- \"'"
 VOID = {"meta", "link", "img", "br", "hr", "input", "base"}
@@ -203,32 +196,6 @@ def test_gains_that_are_not_stable_on_the_model(
     answer, document = report(client, job)
     assert_self_contained(answer, document)
     assert "not stable" in document.text
-
-
-@pytest.fixture(scope="module")
-def old(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
-    """A database of revision 0008, migrated."""
-    folder = tmp_path_factory.mktemp("old")
-    connection = sqlite3.connect(folder / FILE)
-    connection.executescript(SQL)
-    connection.close()
-    store = Store(folder)
-    yield store
-    store.close()
-
-
-@pytest.mark.parametrize("name", GOLDEN["jobs"])
-def test_jobs_of_an_old_database(old: Store, name: str) -> None:
-    row = old.get(GOLDEN["jobs"][name]["id"])
-    events, blocks = old.events(row.id), list(old.blocks(row.id))
-    found = job_figures(row, events, blocks)
-    view = job_view(row, events, None)
-    source = ReportSource(view, None, events, found.record, found.designs, blocks, "0.1.0", "2026-01-31T12:00:00.000Z")
-    document = Document(paper(source))
-    assert row.id in document.text and "nan" not in document.text
-    if view.new_gains is not None:
-        assert numbers.significant(view.new_gains.Kp) in document.text
-        assert found.designs is not None and any(each.gains for each in found.designs.designs)
 
 
 def test_the_document_has_the_fields_of_the_hash() -> None:
