@@ -133,18 +133,18 @@ ADVICE: dict[Reason, str] = {
     Reason.LOCKED: "Somebody has locked the loop: ask them, or unlock it on its page (or by loopwright unlock TAG), "
     "then ask again.",
     Reason.NOT_ACKNOWLEDGED: "The last test found PV to be false, and nobody has acknowledged that: check the sensor, "
-    "sign the alarm off (or loopwright dismiss TAG), then ask again.",
+    "acknowledge the alarm (or loopwright acknowledge TAG), then ask again.",
     Reason.NO_GAIN: "The loop is already tuned as well as asked: nothing needs to be done. For a faster or a more "
     "robust loop ask for another Ms, for a proposal all the same set propose_anyway.",
     Reason.PV_LIMIT: "PV reached its limit: permit less MV deviation, or widen the PV limits if it is safe.",
     Reason.TIME_BUDGET: "The test took longer than its budget: check T95, or raise the budget.",
     Reason.BAD_SAMPLE: "PV was not a finite number, or another one than the plant can give: check the sensor and its "
     "scaling. Where the message says that PV is false, see that the loop is in manual, and control it by hand; when PV "
-    "is right again, sign the alarm off (or loopwright dismiss TAG), put the loop in automatic, then retune.",
+    "is right again, acknowledge the alarm (or loopwright acknowledge TAG), put the loop in automatic, then retune.",
     Reason.SAMPLES_LOST: "Samples were lost on the way: check bus load, or run a simulated plant more slowly.",
     Reason.PV_FROZEN: "PV stood still, or had another noise, as the plant cannot: check the sensor, see that the loop "
-    "is in manual (the message says what it was left in), and control it by hand; when PV is right again, sign the "
-    "alarm off (or loopwright dismiss TAG), put the loop in automatic, then retune.",
+    "is in manual (the message says what it was left in), and control it by hand; when PV is right again, acknowledge "
+    "the alarm (or loopwright acknowledge TAG), put the loop in automatic, then retune.",
     Reason.SETPOINT_CHANGED: "Somebody else moved the set-point during the test; agree on the time and repeat.",
     Reason.MODE_CHANGED: "Somebody else changed the mode during the test; agree on the time and repeat.",
     Reason.GAINS_CHANGED: "Somebody else tried other gains during the test; agree on the time and repeat.",

@@ -31,10 +31,10 @@ def merged(own: Iterable[Alarm], known: AlarmFacts) -> list[Alarm]:
 
     What a gateway has said last stays until it counts as one that does not answer: from then on nothing is known.
     """
-    found = {alarm.id: alarm for alarm in own if alarm.id not in known.signed}
+    found = {alarm.id: alarm for alarm in own if alarm.id not in known.acknowledged}
     silent = {alarm.host for alarm in found.values() if alarm.kind is AlarmKind.GATEWAY_SILENT}
     for gateway in known.gateways:
         for alarm in gateway.alarms:
-            if gateway.name not in silent and alarm.id not in known.signed:
+            if gateway.name not in silent and alarm.id not in known.acknowledged:
                 found.setdefault(alarm.id, alarm)
-    return sorted(found.values(), key=lambda alarm: (alarm.level, alarm.subject, alarm.kind, alarm.id))
+    return sorted(found.values(), key=lambda alarm: (alarm.priority, alarm.subject, alarm.kind, alarm.id))

@@ -44,8 +44,8 @@ from loopwright.service.api.heads import Head
 from loopwright.service.api.idempotency import Idempotent
 from loopwright.service.api.job_views import (
     AcceptDecision,
+    AcknowledgedView,
     Decision,
-    DismissedView,
     JobView,
     LiveErrorView,
     LiveView,
@@ -229,14 +229,14 @@ def create_app(
         )
 
     @app.post(
-        "/loops/{tag}/dismiss",
+        "/loops/{tag}/acknowledge",
         tags=["loops"],
         summary="Take responsibility for a loop whose restoration is not confirmed, or whose PV was found to be false",
         responses=problems.responses(404, 409, 422),
     )
-    def dismiss_loop(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> DismissedView:
-        found = jobs.aftercare.dismiss(tag, signed_by(decision))
-        return DismissedView(loop=tag, jobs=[f"/jobs/{job_id}" for job_id in found])
+    def acknowledge_loop(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> AcknowledgedView:
+        found = jobs.aftercare.acknowledge(tag, signed_by(decision))
+        return AcknowledgedView(loop=tag, jobs=[f"/jobs/{job_id}" for job_id in found])
 
     @app.post(
         "/loops/{tag}/retune",

@@ -165,7 +165,7 @@ class LiveView(BaseModel):
 
 class NotHomeView(BaseModel):
     """A loop whose restoration after a job is not confirmed. The service checks the loop until the restoration is
-    confirmed, or until `POST /loops/TAG/dismiss`."""
+    confirmed, or until `POST /loops/TAG/acknowledge`."""
 
     job: str = Field(description="URL of the job", examples=["/jobs/4f0c2a9be113"])
     reason: Reason | None = Field(description="Reason code from the closed list", examples=["node_not_operational"])
@@ -219,8 +219,8 @@ class LoopDetail(LoopView):
     )
 
 
-class DismissedView(BaseModel):
-    """The jobs whose unconfirmed restoration of a loop was dismissed, or whose finding of a false PV acknowledged."""
+class AcknowledgedView(BaseModel):
+    """The jobs for which somebody has taken over the loop: its restoration was not confirmed, or its PV false."""
 
     loop: str = Field(examples=["TIC-101"])
     jobs: list[str] = Field(

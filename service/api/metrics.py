@@ -14,7 +14,7 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from loopwright.service.alarms.alarm import Level
+from loopwright.service.alarms.alarm import Priority
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.store import looked_after
@@ -27,15 +27,17 @@ MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
 
 class _Alarms(Collector):
-    def __init__(self, counts: Callable[[], Mapping[Level, int]]) -> None:
+    def __init__(self, counts: Callable[[], Mapping[Priority, int]]) -> None:
         self._counts = counts
 
     def collect(self) -> Iterable[Metric]:
         found = GaugeMetricFamily(
-            "loopwright_alarms", "Alarms of the loops and buses of this gateway, 1 is the worst level", labels=["level"]
+            "loopwright_alarms",
+            "Alarms of the loops and buses of this gateway, 1 is the worst priority",
+            labels=["priority"],
         )
-        for level, count in self._counts().items():
-            found.add_metric([str(level)], count)
+        for priority, count in self._counts().items():
+            found.add_metric([str(priority)], count)
         yield found
 
 
@@ -92,7 +94,7 @@ class _OfTheStore(Collector):
     def _waiting(self) -> Metric:
         """A proposal that a later test has followed does not wait any more."""
         latest = [job for job in latest_tests(self._store).values() if job.host == self._store.host]
-        found = GaugeMetricFamily("loopwright_proposals_waiting", "Loops whose latest job waits for a decision")
+        found = GaugeMetricFamily("loopwright_proposals_waiting", "Loops whose latest job awaits a decision")
         found.add_metric([], sum(job.state is JobState.PROPOSED for job in latest))
         return found
 
@@ -108,10 +110,10 @@ def registry(
     loops: Mapping[str, LoopConfig],
     store: Store,
     sdo_retries: Mapping[str, int],
-    alarms: Callable[[], Mapping[Level, int]] = dict,
+    alarms: Callable[[], Mapping[Priority, int]] = dict,
 ) -> CollectorRegistry:
     """The registry of the metrics of a service. sdo_retries: SDO retries by bus, as counted in this process.
-    alarms: returns the number of alarms by level, 0 included."""
+    alarms: returns the number of alarms by priority, 0 included."""
     for bus in {loop.bus for loop in loops.values()}:
         SAMPLES_LOST.labels(bus)  # from 0 on: of a counter that begins with the first loss Prometheus sees none
     found = CollectorRegistry()

@@ -49,7 +49,7 @@ _TAGS = {
     "jobs": "Retunes of one loop: what they found, and the decision on it",
     "retunes": "Retunes of many loops",
     "tunings": "Gains for a model, without a loop",
-    "alarms": "What is abnormal now",
+    "alarms": "The active alarms",
     "live": "Values as they are heard, as a stream",
     "webhooks": "What the service calls by itself when a job awaits a decision or has ended",
     "operations": "The service itself: health, changes, keys and sessions",

@@ -78,7 +78,7 @@ class AuditView(BaseModel):
     said_by: str | None = Field(description="Name of the person, as given in the request", examples=["night shift"])
     what: str = Field(
         description="retune, abort, accept, rollback, accept_failed, rollback_failed, retune_many, retune_many_abort, "
-        "dismiss, alarm_sign_off, lock, unlock, samples_delete, clock_jump, restore, key_create, key_revoke, "
+        "acknowledge, acknowledge_alarm, lock, unlock, samples_delete, clock_jump, restore, key_create, key_revoke, "
         "sign_in, sign_out, sign_in_refused",
         examples=["accept"],
     )

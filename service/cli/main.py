@@ -480,17 +480,17 @@ def _many(client: Client, started: object, wait: bool, as_json: bool) -> int:
 
 
 @app.command()
-def dismiss(
+def acknowledge(
     loop: Annotated[str, typer.Argument(help="Tag of the loop.")], url: Url = DEFAULT_URL, as_json: AsJson = False
 ) -> None:
     """Answer for a loop whose restoration after a job was not confirmed, or whose PV a test has found to be false."""
-    from loopwright.service.api.job_views import DismissedView
+    from loopwright.service.api.job_views import AcknowledgedView
 
-    answer = Client(url).post(f"/loops/{loop}/dismiss", {"by": "cli"})
+    answer = Client(url).post(f"/loops/{loop}/acknowledge", {"by": "cli"})
     if as_json:
         print_json(answer)
         return
-    jobs = parsed(DismissedView, answer).jobs
+    jobs = parsed(AcknowledgedView, answer).jobs
     if jobs:
         print(f"{loop}: you answer for it now. It is looked after for no test, and no false PV keeps a test from it.")
         print(f"Acknowledged: {', '.join(jobs)}")

@@ -51,7 +51,7 @@ class NotHome:
             advice = "Look at the controller; it is looked at again by itself."
         return (
             f"not confirmed home after job {self.job_id}: {self.detail.removeprefix('not confirmed: ')}. {advice} "
-            f"If it is as it should be, sign its alarm off (on a command line: loopwright dismiss {self.loop})"
+            f"If it is as it should be, acknowledge its alarm (on a command line: loopwright acknowledge {self.loop})"
         )
 
 
@@ -120,7 +120,7 @@ class Aftercare:
         with self._store.reading() as session:
             return next(map(false_pv.words, false_pv.not_acknowledged(session, tag)), None)
 
-    def dismiss(self, tag: str, by: str) -> list[str]:
+    def acknowledge(self, tag: str, by: str) -> list[str]:
         """Ends the supervision of a loop, for which an operator now answers, and acknowledges that its PV was false.
         Returns the jobs for which that was so, none when it was not. Raises UnknownLoop, Busy."""
         if self.not_acknowledged(tag) is None and not looked_after.rows(self._store, tag):
@@ -128,7 +128,7 @@ class Aftercare:
             return []
         if (busy := self._store.why_busy(tag)) is not None:
             raise busy
-        return looked_after.dismissed(self._store, tag, by)
+        return looked_after.acknowledged(self._store, tag, by)
 
     def check_due_loops(self) -> None:
         """Reads every loop whose time has come."""

@@ -113,7 +113,7 @@ class AcceptanceWatch(_Kept):
         return conclusion_of([each.compared for each in self.changes])
 
     @property
-    def abnormal(self) -> bool:
+    def alarm(self) -> bool:
         """Whether an alarm is to be made of what was found. Who has rolled back has seen it; what the watch has rolled
         back by itself nobody has seen yet."""
         if self.trouble is not None and self.trouble.put_back:

@@ -64,7 +64,7 @@ def opened(job_id: str, columns: JobColumns) -> Write:
     return write
 
 
-def dismissed(store: Store, loop: str, by: str) -> list[str]:
+def acknowledged(store: Store, loop: str, by: str) -> list[str]:
     """A person answers for the loop. Returns the ids of the jobs it was looked after for, or that had found its PV to
     be false."""
     with store.writing() as session:
@@ -72,13 +72,15 @@ def dismissed(store: Store, loop: str, by: str) -> list[str]:
         found = {row.id: row for row in (*_of_loop(session, loop), *false)}
         for row in found.values():
             before = {"look_after": row.look_after, "reason": row.reason}
-            append(session, row.id, "dismissed", {"by": by}, row.plant_time_s)
-            audit.record(session, "dismiss", row.id, before=before, after={"look_after": False}, loop=loop, said_by=by)
+            append(session, row.id, "acknowledged", {"by": by}, row.plant_time_s)
+            audit.record(
+                session, "acknowledge", row.id, before=before, after={"look_after": False}, loop=loop, said_by=by
+            )
             if row.look_after:
                 row.look_after = False
-                alarms.signed_off_with(session, row, alarms.NOT_RESTORED, by)
+                alarms.acknowledged_with(session, row, alarms.NOT_RESTORED, by)
             if row in false:
-                alarms.signed_off_with(session, row, false_pv.FALSE_PV, by)
+                alarms.acknowledged_with(session, row, false_pv.FALSE_PV, by)
         return list(found)
 
 

@@ -134,7 +134,7 @@ class JobRow(Base):
     session: Mapped[int | None] = mapped_column(BigInteger)
     # The loop was not read back as home: it is looked at until it is, or a person says otherwise.
     look_after: Mapped[bool] = mapped_column(server_default=text("false"), default=False)
-    # The test has found PV to be false: no other begins on the loop until its alarm is signed off.
+    # The test has found PV to be false: no other begins on the loop until its alarm is acknowledged.
     false_pv: Mapped[bool] = mapped_column(server_default=text("false"), default=False)
     # Why the job is to stop, once somebody wants it to: any host may write it, the job's own host acts.
     stop_reason: Mapped[Reason | None] = mapped_column(EnumColumn(Reason))
@@ -310,27 +310,27 @@ class JobFiguresRow(Base):
 
 
 class WatchRow(Base):
-    """The watch of a loop after the gains of a job were accepted. open: whether it goes on.  abnormal: whether an alarm
+    """The watch of a loop after the gains of a job were accepted. open: whether it goes on.  alarm: whether one
     is to be made of what it has found."""
 
     __tablename__ = "watches"
-    __table_args__ = (Index("watches_by_loop", "loop", "open"), Index("abnormal_watches", "abnormal"))
+    __table_args__ = (Index("watches_by_loop", "loop", "open"), Index("watches_with_alarm", "alarm"))
 
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
     loop: Mapped[str]
     open: Mapped[bool]
-    abnormal: Mapped[bool]
+    alarm: Mapped[bool]
     watch: Mapped[AcceptanceWatch] = mapped_column(WatchColumn)
 
 
-class AlarmSignOffRow(Base):
-    """An alarm that somebody has signed off, as it was shown then. job_id: the test it is about; null: about none."""
+class AlarmAcknowledgementRow(Base):
+    """An alarm that somebody has acknowledged, as it was shown then. job_id: the test it is about; null: about none."""
 
-    __tablename__ = "alarm_sign_offs"
-    __table_args__ = (Index("alarm_sign_offs_by_job", "job_id"),)
+    __tablename__ = "alarm_acknowledgements"
+    __table_args__ = (Index("alarm_acknowledgements_by_job", "job_id"),)
 
     alarm_id: Mapped[str] = mapped_column(primary_key=True)
-    level: Mapped[int]
+    priority: Mapped[int]
     kind: Mapped[str]
     host: Mapped[str]
     loop: Mapped[str | None]

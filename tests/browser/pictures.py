@@ -131,10 +131,10 @@ def photograph(fleet: Fleet, camera: Photographer, jobs: dict[str, str], locked:
         expect(page.get_by_role("slider", name="Ms")).to_be_enabled()
 
     def refused(page: Page) -> None:
-        expect(person.headline(page)).to_contain_text("No result to trust")
+        expect(person.headline(page)).to_contain_text("Refused: ")
         expect(page.get_by_role("img", name="MV", exact=True)).to_be_visible()
 
-    def abnormal(page: Page) -> None:
+    def alarm(page: Page) -> None:
         expect(page.get_by_role("row").nth(3)).to_be_visible()
 
     def asked(page: Page) -> None:
@@ -157,7 +157,7 @@ def photograph(fleet: Fleet, camera: Photographer, jobs: dict[str, str], locked:
         camera.take(name, f"/ui/loops/{RESULT}", result, size, palette)
     camera.take("refused", f"/ui{jobs[REFUSED]}", refused)
     camera.take("jobs", "/ui/jobs", lambda page: expect(page.get_by_role("row")).to_have_count(len(jobs) + 1), LOW)
-    camera.take("abnormal", "/ui/alarms", abnormal, LOW)
+    camera.take("abnormal", "/ui/alarms", alarm, LOW)
     camera.take("retune", f"/ui/loops/{UNTUNED}", asked, WITH_FORM)
     camera.take("retunes", "/ui/retunes", many, LOW)
     camera.take("log", "/ui/log", lambda page: expect(page.get_by_role("row").nth(len(jobs))).to_be_visible(), LOW)
@@ -178,7 +178,7 @@ def photograph(fleet: Fleet, camera: Photographer, jobs: dict[str, str], locked:
 
     def overview(page: Page) -> None:
         expect(page.locator(".spark path").first).to_be_attached()
-        expect(page.get_by_role("link", name="abnormal")).to_be_visible()
+        expect(page.get_by_role("link", name="active alarm")).to_be_visible()
         expect(page.get_by_role("row", name="TIC-401")).to_contain_text("Bus")
 
     camera.take("test", f"/ui/loops/{UNDER_TEST[0]}", testing)

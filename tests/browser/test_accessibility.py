@@ -63,7 +63,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[States]:
 
 def loops(pages: Pages, site: States) -> Page:
     page = pages.open(bypass_csp=True)
-    expect(page.get_by_role("link", name=re.compile(r"\d abnormal"))).to_be_visible()
+    expect(page.get_by_role("link", name=re.compile(r"\d active alarm"))).to_be_visible()
     expect(page.get_by_role("row", name=AT_REST)).to_be_visible()
     return page
 
@@ -90,13 +90,13 @@ def result(pages: Pages, site: States) -> Page:
 def decision(pages: Pages, site: States) -> Page:
     page = result(pages, site)
     page.get_by_role("button", name="Accept the new gains…").click()
-    expect(person.decision(page).get_by_label("Signed")).to_be_focused()
+    expect(person.decision(page).get_by_label("Your name")).to_be_focused()
     return page
 
 
 def refused(pages: Pages, site: States) -> Page:
     page = pages.open(f"/ui{site.refused}", bypass_csp=True)
-    expect(person.headline(page)).to_contain_text("No result to trust")
+    expect(person.headline(page)).to_contain_text("Refused: ")
     return page
 
 
@@ -119,7 +119,7 @@ def one_of_many(pages: Pages, site: States) -> Page:
     return page
 
 
-def abnormal(pages: Pages, site: States) -> Page:
+def alarm(pages: Pages, site: States) -> Page:
     page = pages.open("/ui/alarms", bypass_csp=True)
     expect(page.get_by_role("row").nth(2)).to_be_visible()
     return page
@@ -145,7 +145,7 @@ def report(pages: Pages, site: States) -> Page:
 
 
 VIEWS: tuple[Callable[[Pages, States], Page], ...] = (
-    loops, at_rest, under_test, result, decision, refused, jobs, many, one_of_many, abnormal, log, keys, report,
+    loops, at_rest, under_test, result, decision, refused, jobs, many, one_of_many, alarm, log, keys, report,
 )  # fmt: skip
 
 

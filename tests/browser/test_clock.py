@@ -25,7 +25,7 @@ def test_ages_are_of_the_service_and_what_is_live_is_live(site: Site, pages: Pag
     context.clock.install(time=datetime.now(UTC) + timedelta(hours=wrong_h))
     page = pages.another(context)
     row = page.get_by_role("row", name=TAG)
-    expect(row).to_contain_text(re.compile(r"decision waits\s*(just now|\d+.s ago|[1-5].min ago)"))
+    expect(row).to_contain_text(re.compile(r"awaiting decision\s*(just now|\d+.s ago|[1-5].min ago)"))
     expect(row.locator(".pvnum")).to_have_text(re.compile(r"^50\.0"))
     person.open_loop(page)
     expect(person.face(page).locator(".mode").first).to_have_text("AUTO")

@@ -33,7 +33,7 @@ def test_a_loop_of_another_gateway(site: GatewaySite, pages: Pages) -> None:
     expect(page.locator(".face .big")).to_have_text("50.000")
     expect(page.locator(".trend")).to_contain_text(f"Samples as they come are at gateway {OTHER}")
     page.get_by_role("button", name="Accept the new gains…").click()
-    page.get_by_label("Signed").fill("A. Lind")
+    page.get_by_label("Your name").fill("A. Lind")
     page.get_by_role("button", name=f"Write to {LOOP}").click()
     expect(page.locator(".decide")).to_contain_text("Accepted by A. Lind")
     assert abs(site.kp() - CASE.kp) > 1.0
@@ -46,10 +46,10 @@ def test_a_loop_of_another_gateway(site: GatewaySite, pages: Pages) -> None:
     old = page.locator(".face.old")
     expect(old.locator(".age")).to_have_text(re.compile(r"^\d.* old$"))
     expect(old.locator(".big")).to_have_text("50.000")
-    expect(page.locator(".abnormal")).to_contain_text(f"Gateway {OTHER} does not answer.")
+    expect(page.locator(".loop-alarm")).to_contain_text(f"Gateway {OTHER} does not answer.")
     expect(page.locator(".refusal")).to_have_count(0)
     # The other abnormal thing is TIC-1 of this gateway, which has no node.
-    page.get_by_role("link", name="2 abnormal").click()
+    page.get_by_role("link", name="2 active alarm").click()
     silent = page.get_by_role("row", name=f"gateway {OTHER}")
     expect(silent.get_by_role("link", name=LOOP)).to_be_visible()
     expect(silent.get_by_role("button")).to_have_count(0)

@@ -106,7 +106,7 @@ class TestWhatOthersDo:
     def test_a_decision_is_seen_in_the_list_of_jobs(self, site: SimulatedSite, pages: Pages) -> None:
         job_id = proposal(site.service)
         page = pages.open("/ui/jobs")
-        expect(page.get_by_role("row", name=TAG)).to_contain_text("decision waits")
+        expect(page.get_by_role("row", name=TAG)).to_contain_text("awaiting decision")
         site.service.jobs.decisions.rollback(job_id, "B. Roth")
         expect(page.get_by_role("row", name=TAG)).to_contain_text("B. Roth")
 
@@ -121,7 +121,7 @@ class TestWhatOthersDo:
             "known": "", "detail": "", "advice": None, "changes_used": [], "changes_dropped": [], "loads": [],
         }  # fmt: skip
         page.route("**/observation", lambda route: route.fulfill(json=found))
-        page.get_by_role("button", name="Look at normal operation").click()
+        page.get_by_role("button", name="Identify from operation").click()
         expect(known).to_contain_text("1.61")
         proposal(site.service)
         expect(known).not_to_contain_text("1.61")
@@ -328,7 +328,7 @@ class TestStream:
         context = pages.context()
         context.clock.install()
         page = pages.another(context, "/ui/alarms")
-        expect(page.get_by_text("Nothing is abnormal.")).to_be_visible()
+        expect(page.get_by_text("No active alarms.")).to_be_visible()
         page.evaluate(HIDE, True)
         page.clock.fast_forward("01:05")
         service = site.service

@@ -39,7 +39,7 @@ def test_every_view_fits(site: Site, pages: Pages, size: dict[str, int]) -> None
         ("/jobs", "Jobs"),
         ("/retunes", "Retunes of many loops"),
         (many["url"], "Retune of 1 loop"),
-        ("/alarms", "Abnormal"),
+        ("/alarms", "Alarms"),
         ("/log", "Log"),
     ):
         page.goto(f"/ui{path}")

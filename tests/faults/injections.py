@@ -348,7 +348,7 @@ def pv_false(by: float | None) -> Injection:
         if answer.status_code == 202:
             stand.site.http.post(f"{answer.headers['location']}/abort")
             stand.site.finished(answer.headers["location"])
-        stand.site.http.post(f"/loops/{TAG}/dismiss", json={"by": "operator"})
+        stand.site.http.post(f"/loops/{TAG}/acknowledge", json={"by": "operator"})
 
     return contextmanager(inject)
 

@@ -25,7 +25,7 @@ _PREVIEW = re.compile(r"/loops/[^/]+/retune/preview|/retunes/preview")
 class RequestKind(StrEnum):
     """The kind of a request; the value is how a refusal names it."""
 
-    ABORT = "aborts and dismissals"
+    ABORT = "aborts and acknowledgements"
     DECISION = "acceptances and rollbacks"
     COMMAND = "commands"
     READ = "reads of the database"
@@ -40,7 +40,7 @@ class RequestKind(StrEnum):
 
 DECIDES = (RequestKind.ABORT, RequestKind.DECISION)
 _LAST_WORDS = {
-    "abort": RequestKind.ABORT, "dismiss": RequestKind.ABORT,
+    "abort": RequestKind.ABORT, "acknowledge": RequestKind.ABORT,
     "accept": RequestKind.DECISION, "rollback": RequestKind.DECISION,
 }  # fmt: skip
 _OF_FIGURES = ("record", "designs", "report")

@@ -286,7 +286,7 @@ def _table(
 
     within = None if job.evidence is None else job.evidence.uncertainty
     row("Ms", "", *figure("Ms"), 2, f" ± {n.Ms_error(within)}" if within is not None and new is not None else "")
-    row("Gain margin GM", "the plant's gain may grow by this factor", *figure("GM"), 2)
+    row("Gain margin GM", "", *figure("GM"), 2)
     row("Phase margin PM", "°", *figure("PM_deg"), 0)
     row("Overshoot of a set-point step", "%", *figure("overshoot_pct"), 0)
 
@@ -296,10 +296,10 @@ def _table(
 
     compared = job.comparison
     asked = _at_most(None if compared is None else compared.settling_s_asked)
-    row("Settling after a set-point step", f"s, into 5 %{asked}", *figure_step("settling_s", "setpoint"))
+    row("Settling time (5 %)", f"s{asked}", *figure_step("settling_s", "setpoint"))
     if compared is not None and compared.mv_peak_asked is not None:
         asked = _at_most(compared.mv_peak_asked)
-        row("Change of MV after it, at most", f"% per {pv_unit}{asked}", *figure_step("mv_peak", "setpoint"))
+        row("Largest output move", f"% per {pv_unit}{asked}", *figure_step("mv_peak", "setpoint"))
     row("IAE of a unit set-point step", "s", *figure_step("IAE", "setpoint"))
     row(f"IAE of a load step of {LOAD_PCT:g} %", f"{pv_unit} s", *figure_step("IAE", "load"))
     row("Largest deviation after it", pv_unit, *figure_step("peak", "load"))
@@ -311,7 +311,7 @@ def _table(
             return found[0], found[1]
 
         row("Overshoot, measured", "%", *both("overshoot_pct"), 0)
-        row("Settling, measured", "s", *both("settling_s"))
+        row("Settling time (5 %), measured", "s", *both("settling_s"))
         row("IAE, measured", f"{pv_unit} s", *both("IAE"))
     return rows
 
@@ -381,7 +381,7 @@ def _model_rows(source: ReportSource, pv_unit: str) -> list[Row]:
         )
         rows.append(("Ms is known to", f"{unsure} that explain the record as well", True))
         left = "–" if found.residual is None else f"{n.fixed(found.residual, 2)} times the noise at rest"
-        rows.append(("not explained", left, False))
+        rows.append(("residual", left, False))
         rows.append(("excitation", f"{found.switches} switches or turns, {n.significant(found.period_s, 3)} s", False))
         if (seen := found.longest_delay_seen_s) is not None:
             text = f"would show up to {n.significant(seen, 3)} s later, with 30 % of the effect of MV; not a later one"

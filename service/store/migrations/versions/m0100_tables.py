@@ -164,15 +164,15 @@ def upgrade() -> None:
         sa.Column("job_id", sa.String, sa.ForeignKey("jobs.id"), primary_key=True),
         sa.Column("loop", sa.String, nullable=False),
         sa.Column("open", sa.Boolean, nullable=False),
-        sa.Column("abnormal", sa.Boolean, nullable=False),
+        sa.Column("alarm", sa.Boolean, nullable=False),
         sa.Column("watch", sa.JSON, nullable=False),
     )
-    op.create_index("abnormal_watches", "watches", ["abnormal"])
     op.create_index("watches_by_loop", "watches", ["loop", "open"])
+    op.create_index("watches_with_alarm", "watches", ["alarm"])
     op.create_table(
-        "alarm_sign_offs",
+        "alarm_acknowledgements",
         sa.Column("alarm_id", sa.String, primary_key=True),
-        sa.Column("level", sa.Integer, nullable=False),
+        sa.Column("priority", sa.Integer, nullable=False),
         sa.Column("kind", sa.String, nullable=False),
         sa.Column("host", sa.String, nullable=False),
         sa.Column("loop", sa.String),
@@ -182,7 +182,7 @@ def upgrade() -> None:
         sa.Column("by", sa.String, nullable=False),
         sa.Column("at", sa.String, nullable=False),
     )
-    op.create_index("alarm_sign_offs_by_job", "alarm_sign_offs", ["job_id"])
+    op.create_index("alarm_acknowledgements_by_job", "alarm_acknowledgements", ["job_id"])
     op.create_table(
         "webhook_deliveries",
         sa.Column("number", sa.Integer, primary_key=True, autoincrement=True),
@@ -271,7 +271,7 @@ def downgrade() -> None:
     op.drop_table("retune_loops")
     op.drop_table("retunes")
     op.drop_table("webhook_deliveries")
-    op.drop_table("alarm_sign_offs")
+    op.drop_table("alarm_acknowledgements")
     op.drop_table("watches")
     op.drop_table("job_figures")
     op.drop_table("job_knowledge")

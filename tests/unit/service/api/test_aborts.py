@@ -45,7 +45,7 @@ def aborted(service: Service, job_id: str) -> AuditRow:
     ("method", "path", "stops"),
     [("POST", "/jobs/4f0c2a9be113/abort", True), ("POST", "/retunes/4f0c2a9be113/abort", True),
      ("GET", "/jobs/4f0c2a9be113/abort", False), ("DELETE", "/jobs/4f0c2a9be113/abort", False),
-     ("POST", "/jobs/4f0c2a9be113/accept", False), ("POST", "/loops/TIC-101/dismiss", False),
+     ("POST", "/jobs/4f0c2a9be113/accept", False), ("POST", "/loops/TIC-101/acknowledge", False),
      ("POST", "/jobs/x/abort/abort", False), ("POST", "/loops/x/abort", False)],
 )  # fmt: skip
 def test_which_requests_stop_a_test(method: str, path: str, stops: bool) -> None:
@@ -92,7 +92,7 @@ def test_another_request_that_the_database_does_not_take_is_refused_as_before(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(service.store, "writing", away)
-    for path in (f"/loops/{TAG}/retune", f"/loops/{TAG}/dismiss", "/jobs/4f0c2a9be113/accept"):
+    for path in (f"/loops/{TAG}/retune", f"/loops/{TAG}/acknowledge", "/jobs/4f0c2a9be113/accept"):
         assert_problem(client.post(path, json={}, headers=KEY), 503)
 
 
@@ -103,7 +103,7 @@ def without_a_turn(client: TestClient, path: str) -> int:
 
 
 def with_a_key_of_another_request(client: TestClient, path: str) -> int:
-    assert client.post("/loops/FIC-2/dismiss", json={}, headers=KEY).status_code == 200
+    assert client.post("/loops/FIC-2/acknowledge", json={}, headers=KEY).status_code == 200
     return client.post(path, json={"by": "me"}, headers=KEY).status_code
 
 

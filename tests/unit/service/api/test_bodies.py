@@ -26,7 +26,7 @@ from tests.unit.service.postgres import Server
 JSON = {"Content-Type": "application/json"}
 POSTS = [
     f"/loops/{TAG}/retune", f"/loops/{TAG}/retune/preview", "/retunes", "/tunings", "/jobs/none/rollback",
-    f"/loops/{TAG}/dismiss",
+    f"/loops/{TAG}/acknowledge",
 ]  # fmt: skip
 
 

@@ -146,7 +146,7 @@ def test_an_abort_goes_before_the_rate_of_reading(service: Service, stack: ExitS
         ("GET", "/metrics", RequestKind.WATCH),
         ("POST", "/jobs/4f0c2a9be113/abort", RequestKind.ABORT),
         ("POST", "/retunes/4f0c2a9be113/abort", RequestKind.ABORT),
-        ("POST", "/loops/TIC-101/dismiss", RequestKind.ABORT),
+        ("POST", "/loops/TIC-101/acknowledge", RequestKind.ABORT),
         ("POST", "/jobs/4f0c2a9be113/accept", RequestKind.DECISION),
         ("POST", "/jobs/4f0c2a9be113/rollback", RequestKind.DECISION),
         ("POST", "/loops/TIC-101/retune", RequestKind.COMMAND),

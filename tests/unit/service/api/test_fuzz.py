@@ -137,7 +137,7 @@ class Site:
         return self.retunes[-1]
 
     def alarm(self) -> str:
-        """An alarm that may be signed off, or where there is none one that was."""
+        """An alarm that may be acknowledged, or where there is none one that was."""
         for each in self.client.get("/alarms").json():
             self.alarms.append(each["id"])
         return self.alarms[-1]

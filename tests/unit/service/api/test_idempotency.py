@@ -104,8 +104,8 @@ def a_tuning(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]
     return "/tunings", MODEL
 
 
-def a_dismissal(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
-    return f"/loops/{TAG}/dismiss", {}
+def an_acknowledged_loop(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
+    return f"/loops/{TAG}/acknowledge", {}
 
 
 def a_lock(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
@@ -117,17 +117,17 @@ def an_unlock(service: Service, client: TestClient) -> tuple[str, dict[str, Any]
     return f"/loops/{TAG}/unlock", {}
 
 
-def a_sign_off(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
+def an_acknowledgement(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
     service.tune.ends = Failed(Reason.NODE_LOST, "silent")
     service.wait(service.jobs.start(TAG, FastRetune()).id)
     (alarm,) = client.get("/alarms").json()
-    return f"/alarms/{alarm['id']}/sign-off", {"by": "me"}
+    return f"/alarms/{alarm['id']}/acknowledge", {"by": "me"}
 
 
 Asked = Callable[[Service, TestClient], tuple[str, dict[str, Any]]]
 EVERY: list[Asked] = [
-    a_retune, a_dry_run, a_retune_of_many, an_acceptance, a_rollback, an_abort, an_abort_of_many, a_tuning, a_dismissal,
-    a_lock, an_unlock, a_sign_off,
+    a_retune, a_dry_run, a_retune_of_many, an_acceptance, a_rollback, an_abort, an_abort_of_many, a_tuning,
+    an_acknowledged_loop, a_lock, an_unlock, an_acknowledgement,
 ]  # fmt: skip
 
 

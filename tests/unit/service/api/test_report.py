@@ -148,7 +148,7 @@ def test_markup_in_what_people_and_devices_say_stays_text(
 @pytest.mark.parametrize(
     ("ends", "headline"),
     [
-        (Refused(Reason.NOT_AT_REST, "PV moved by 3 <degC>"), "No result to trust: not at rest"),
+        (Refused(Reason.NOT_AT_REST, "PV moved by 3 <degC>"), "Refused: not at rest"),
         (Failed(Reason.NODE_LOST, "node 32 does not answer"), "Failed: the node was lost"),
         (RuntimeError("defect"), "Failed: an error inside the service"),
     ],
@@ -171,7 +171,7 @@ def test_a_job_stopped_by_somebody(service: Service, client: TestClient) -> None
     service.wait(job)
     answer, document = report(client, job)
     assert_self_contained(answer, document)
-    assert "Stopped: by an operator" in document.text and "B. Holm" in document.text
+    assert "Aborted: by an operator" in document.text and "B. Holm" in document.text
     assert "At the end the loop was read back: automatic" in document.text
 
 
@@ -226,6 +226,8 @@ def test_numbers(value: float | None, text: str) -> None:
 
 def test_a_step_that_follows_a_relay_is_said_not_to_begin_at_rest() -> None:
     """Its overshoot in the picture is not that of the gains."""
-    assert mark_names(["preflight", "relay", "design", "verify"])[-1] == "Step, from where the relay left PV"
-    assert mark_names(["preflight", "pulses", "design", "verify"])[-1] == "Step, from where the pulses left PV"
+    assert mark_names(["preflight", "relay", "design", "verify"])[-1] == "Set-point step, from where the relay left PV"
+    assert (
+        mark_names(["preflight", "pulses", "design", "verify"])[-1] == "Set-point step, from where the pulses left PV"
+    )
     assert mark_names(["preflight", "verify"])[-1] == stage_name("verify")

@@ -506,7 +506,7 @@ def test_rehearse_speaks_like_retune(tmp_path: Path) -> None:
     file.write_text(json.dumps({"name": "heater", "K": 0.8, "T_s": 120, "L_s": 15, "noise_std": 0.0005}))
     shown = run("rehearse", str(file))
     assert shown.exit_code == 0, shown.output
-    for words in ("Relay: ", "Model and gains: ", "rehearsal on heater", "predicted overshoot", "MV unit per PV unit"):
+    for words in ("Relay test: ", "Model and gains: ", "rehearsal on heater", "predicted overshoot", "MV unit per PV unit"):
         assert words in shown.output
     assert "{" not in shown.output
     echoed = json.loads(run("rehearse", str(file), "--json").stdout)["input"]

@@ -176,8 +176,9 @@ def test_another_program_at_the_address_is_named_as_such(
     [("loops", [{"name": "TIC-101"}]), ("jobs", [{"id": 7}]), ("job 0123456789ab", {"id": "0123456789ab"}),
      ("job 0123456789ab --accept", {"id": "0123456789ab"}), ("job 0123456789ab --follow", {"state": "pondering"}),
      ("loop TIC-101", {}), ("observe TIC-101", {}), ("alarms", {"alarms": None}), ("retunes", [{}]),
-     ("webhooks", [{}]), ("retune TIC-101 --preview", {}), ("retune TIC-101 --yes --wait", {}), ("dismiss TIC-101", {}),
-     ("lock TIC-101 --reason valve", {}), ("unlock TIC-101", {}), ("alternatives 0123456789ab", {})],
+     ("webhooks", [{}]), ("retune TIC-101 --preview", {}), ("retune TIC-101 --yes --wait", {}),
+     ("acknowledge TIC-101", {}), ("lock TIC-101 --reason valve", {}), ("unlock TIC-101", {}),
+     ("alternatives 0123456789ab", {})],
 )  # fmt: skip
 def test_a_service_of_another_version_is_named_as_such(
     monkeypatch: pytest.MonkeyPatch, command: str, answer: object

@@ -216,7 +216,7 @@ def test_a_loop_that_is_configured_no_more_is_kept_and_can_be_dismissed(service:
     service.jobs.aftercare.check_due_loops()
     (found,) = service.jobs.aftercare.not_home()
     assert "no longer configured here" in found.words
-    assert service.jobs.aftercare.dismiss("GONE", "me") == [row.id] and service.jobs.aftercare.not_home() == []
+    assert service.jobs.aftercare.acknowledge("GONE", "me") == [row.id] and service.jobs.aftercare.not_home() == []
 
 
 def test_it_moves_with_its_loop_to_another_host(tmp_path: Path, postgres: Server) -> None:
@@ -251,7 +251,7 @@ def test_who_asks_is_told(service: Service, clock: Clock, client: TestClient) ->
     ready = client.get("/readyz")
     part = ready.json()["parts"][f"loop {TAG}"]
     assert ready.status_code == 503 and not part["ready"]
-    for words in (row.id, STOPPED, "start it (NMT)", f"loopwright dismiss {TAG}"):
+    for words in (row.id, STOPPED, "start it (NMT)", f"loopwright acknowledge {TAG}"):
         assert words in part["detail"]
     assert b"loopwright_loops_looked_after 1.0" in exposition(registry(service.loops, service.store, {}))
 
@@ -262,7 +262,7 @@ def test_a_loop_that_is_away_is_shown_with_what_is_known(service: Service, clock
     answer = client.get(f"/loops/{TAG}")
     assert answer.status_code == 200 and answer.json()["live"] is None
     assert answer.json()["not_confirmed_home"]["reason"] == "node_lost"
-    service.jobs.aftercare.dismiss(TAG, "me")
+    service.jobs.aftercare.acknowledge(TAG, "me")
     found = client.get(f"/loops/{TAG}").json()
     assert found["live"] is found["not_confirmed_home"] is None and found["live_error"]["reason"] == "node_lost"
 
@@ -279,21 +279,21 @@ def test_ready_again_once_it_is_home(service: Service, clock: Clock, client: Tes
 def test_a_person_answers_for_it(service: Service, clock: Clock, client: TestClient) -> None:
     row = left_by_a_job(service, stopped)
     for jobs in ([f"/jobs/{row.id}"], []):  # the second time there is nothing to end, and no entry
-        answer = client.post(f"/loops/{TAG}/dismiss", json={"by": "night shift"})
+        answer = client.post(f"/loops/{TAG}/acknowledge", json={"by": "night shift"})
         assert (answer.status_code, answer.json()) == (200, {"loop": TAG, "jobs": jobs})
     assert not service.store.get(row.id).look_after
-    entries = audit.trail(service.store.engine, 10, what=["dismiss"])
+    entries = audit.trail(service.store.engine, 10, what=["acknowledge"])
     assert [(entry.subject, entry.loop, entry.said_by) for entry in entries] == [(row.id, TAG, "night shift")]
-    assert [event.data for event in service.store.events(row.id) if event.kind == "dismissed"] == [
+    assert [event.data for event in service.store.events(row.id) if event.kind == "acknowledged"] == [
         {"by": "night shift"}
     ]
-    assert client.post("/loops/NONE/dismiss").status_code == 404
+    assert client.post("/loops/NONE/acknowledge").status_code == 404
 
 
 def test_while_a_job_has_the_loop_nobody_can_answer_for_it(service: Service, clock: Clock, client: TestClient) -> None:
     left_by_a_job(service, stopped)
     active = service.store.create(TAG, {}, "me", False)
-    answer = client.post(f"/loops/{TAG}/dismiss")
+    answer = client.post(f"/loops/{TAG}/acknowledge")
     assert answer.status_code == 409 and answer.json()["job"] == f"/jobs/{active.id}"
 
 
@@ -301,5 +301,5 @@ def test_the_command(service: Service, clock: Clock, client: TestClient, monkeyp
     row = left_by_a_job(service, stopped)
     monkeypatch.setattr(Client, "post", lambda self, path, body: client.post(path, json=body).json())
     for words in (f"Acknowledged: /jobs/{row.id}", f"{TAG}: there was nothing to acknowledge."):
-        ran = CliRunner().invoke(cli.app, ["dismiss", TAG])
+        ran = CliRunner().invoke(cli.app, ["acknowledge", TAG])
         assert ran.exit_code == 0 and words in ran.stdout

@@ -77,10 +77,10 @@ def test_the_job_says_what_the_loop_is_and_who_has_to_act(service: Service) -> N
 def test_no_test_begins_until_a_person_has_acknowledged_it(service: Service, client: TestClient) -> None:
     job = ended(service)
     assert f"job {job.id} found PV of loop {TAG} to be false" in refused(service)
-    assert f"loopwright dismiss {TAG}" in refused(service)
+    assert f"loopwright acknowledge {TAG}" in refused(service)
     answer = client.post(f"/loops/{TAG}/retune", json={"requested_by": "A. Lind"})
     assert (answer.status_code, answer.json()["reason"]) == (409, "not_acknowledged")
-    assert f"loopwright dismiss {TAG}" in answer.json()["detail"] and job.id in answer.json()["detail"]
+    assert f"loopwright acknowledge {TAG}" in answer.json()["detail"] and job.id in answer.json()["detail"]
     preview = client.post(f"/loops/{TAG}/retune/preview", json={}).json()
     assert not preview["would_start"]
     assert "not_acknowledged" in [each["reason"] for each in preview["obstacles"]]
@@ -91,12 +91,12 @@ def test_no_test_begins_until_a_person_has_acknowledged_it(service: Service, cli
     service.wait(rehearsal.id)
     assert service.store.get(rehearsal.id).state is JobState.REHEARSED
 
-    assert client.post(f"/loops/{TAG}/dismiss", json={"by": "A. Lind"}).json()["jobs"] == [f"/jobs/{job.id}"]
+    assert client.post(f"/loops/{TAG}/acknowledge", json={"by": "A. Lind"}).json()["jobs"] == [f"/jobs/{job.id}"]
     assert client.get(f"/loops/{TAG}").json()["not_acknowledged"] is None
-    assert client.post(f"/loops/{TAG}/dismiss", json={"by": "A. Lind"}).json()["jobs"] == []
-    entries = audit.trail(service.store.engine, 10, what=["dismiss", "alarm_sign_off"])
+    assert client.post(f"/loops/{TAG}/acknowledge", json={"by": "A. Lind"}).json()["jobs"] == []
+    entries = audit.trail(service.store.engine, 10, what=["acknowledge", "acknowledge_alarm"])
     assert {(entry.what, entry.loop, entry.said_by) for entry in entries} == {
-        ("dismiss", TAG, "A. Lind"), ("alarm_sign_off", TAG, "A. Lind"),
+        ("acknowledge", TAG, "A. Lind"), ("acknowledge_alarm", TAG, "A. Lind"),
     }  # fmt: skip
     service.controller.state = replace(service.controller.state, mode=Mode.AUTOMATIC)
     service.wait(service.jobs.start(TAG, FastRetune()).id)
@@ -108,7 +108,7 @@ def test_signing_its_alarm_off_is_acknowledging_it(service: Service) -> None:
     (alarm,) = watch.look()
     assert (alarm.level, alarm.job, alarm.kind) == (1, f"/jobs/{job.id}", "false_pv")
     assert "the loop was left in manual at MV 40 %" in alarm.text
-    watch.sign_off(alarm.id, "A. Lind")
+    watch.acknowledge(alarm.id, "A. Lind")
     assert watch.look() == ()
     service.wait(service.jobs.start(TAG, FastRetune()).id)
 

@@ -242,7 +242,7 @@ def test_a_locked_loop_is_looked_after(service: Service, client: TestClient) -> 
     service.jobs.aftercare.check_due_loops()
     assert not service.store.get(job.id).look_after
     service.store.note(job.id, look_after=True)
-    assert client.post(f"/loops/{TAG}/dismiss").json()["jobs"] == [f"/jobs/{job.id}"]
+    assert client.post(f"/loops/{TAG}/acknowledge").json()["jobs"] == [f"/jobs/{job.id}"]
 
 
 def test_a_retune_of_many_skips_it_and_says_so(service: Service, client: TestClient) -> None:

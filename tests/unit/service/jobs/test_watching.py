@@ -101,8 +101,8 @@ def test_a_loop_that_becomes_unstable_gets_its_old_gains_back(service: Service, 
     last = audit.trail(service.store.engine, 1)[0]
     assert (last.what, last.said_by, last.who) == ("rollback", "watch after acceptance", "service")
     (alarm,) = alarms(client, "rolled_back")
-    assert alarm["to_sign"] and "put back by the watch" in alarm["text"]
-    client.post(f"/alarms/{alarm['id']}/sign-off", json={"by": "operator B"})
+    assert alarm["unacknowledged"] and "put back by the watch" in alarm["text"]
+    client.post(f"/alarms/{alarm['id']}/acknowledge", json={"by": "operator B"})
     alarms(client)
     here.goes_on(3.0)
     assert service.store.get(here.job_id).state is JobState.ROLLED_BACK

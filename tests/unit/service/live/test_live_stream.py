@@ -129,7 +129,7 @@ def test_alarms_come_first_and_on_every_change_as_a_whole(screens: Screens) -> N
         assert (alarm["level"], alarm["loop"], alarm["text"]) == (3, TAG, "The last test failed: node lost")
         with viewing(screens.base) as later:
             later.becomes("alarms", lambda message: message.get("alarms") == [alarm])
-            screens.alarms.sign_off(alarm["id"], "A. Lind")
+            screens.alarms.acknowledge(alarm["id"], "A. Lind")
             for each in (viewer, later):
                 each.becomes("alarms", lambda message: message.get("alarms") == [])
         seen = [message for name, message in viewer.messages if name == "alarms"]

@@ -10,7 +10,7 @@ import { beginPalette } from "./palette.js";
 import { beginRouting, decoded, go, path } from "./router.js";
 import { jobs, may, refreshLoops, refreshSession } from "./state.js";
 import { stream } from "./stream.js";
-import { AbnormalView } from "./views/abnormal.js";
+import { AlarmsView } from "./views/alarms.js";
 import { Banner, Bar, Dock, dockLoop } from "./views/frame.js";
 import { JobView } from "./views/job.js";
 import { JobsView } from "./views/jobs.js";
@@ -28,7 +28,7 @@ function View() {
   if (part[2] === "jobs" && part[3]) return html`<${JobView} key=${`job ${part[3]}`} id=${part[3]} />`;
   if (part[2] === "jobs") return html`<${JobsView} key="jobs" />`;
   if (part[2] === "retunes") return html`<${RetunesView} key="retunes" id=${part[3] ?? ""} />`;
-  if (part[2] === "alarms") return html`<${AbnormalView} key="alarms" />`;
+  if (part[2] === "alarms") return html`<${AlarmsView} key="alarms" />`;
   if (part[2] === "log") return html`<${LogView} key="log" />`;
   return html`<${LoopsView} key="loops" />`;
 }

@@ -39,7 +39,7 @@ export function forgetRows() {
 export const buses = signal(/** @type {{host: string, bus: string, up: boolean | null, why: string | null}[]} */ ([]));
 /** Live jobs. */
 export const jobs = signal(/** @type {any[]} */ ([]));
-/** What is abnormal, as the service says, the worst first; null: it has not said yet. */
+/** The active alarms, as the service says, the worst first; null: it has not said yet. */
 export const alarms = signal(/** @type {any[] | null} */ (null));
 
 /** The present, wall time of the service, s, renewed each second. */

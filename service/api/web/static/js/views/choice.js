@@ -55,7 +55,7 @@ export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
   const verdict = atTested && !decided ? job.comparison?.verdict : chosen.beside;
 
   return html`<div class="card choice"><div class="body"><div ref=${curve}>
-      ${designed && html`<div class="curve" key="curve"><div class="split"><span class="title">Faster or more robust</span><span>Ms <b>${msText(ms)}</b> <span class="quiet">${atTested ? testedWords(job) : "not tested"}</span></span></div>
+      ${designed && html`<div class="curve" key="curve"><div class="split"><span class="title">Robustness</span><span>Ms <b>${msText(ms)}</b> <span class="quiet">${atTested ? testedWords(job) : "not tested"}</span></span></div>
         ${Curve(width, points, ms, tested, old?.Ms ?? null, old?.stable ? (old.load?.IAE ?? null) : null)}
         <input type="range" min=${designs[0].ms} max=${designs[designs.length - 1].ms} step="0.01" value=${ms} disabled=${designs.length < 2} aria-label="Ms" aria-valuetext=${`Ms ${msText(ms)}, ${atTested ? testedWords(job) : "not tested"}`}
           onInput=${(/** @type {any} */ e) => setMs(nearest(designs, Number(e.target.value)))}
@@ -123,12 +123,12 @@ function Table(loop, job, chosen, was, atTested, size, found) {
     ...(old?.Td || gains.Td ? /** @type {any[]} */ ([[html`Derivative time Td <small>s</small>`, "td", old?.Td, gains.Td, significant]]) : []),
     ...(weight(old) || weight(gains) ? /** @type {any[]} */ ([[html`Set-point weight b`, "b", old?.b, gains.b, (/** @type {any} */ v) => significant(v, 3)]]) : []),
     [html`Overshoot <small>%</small>`, "os", stable ? a.overshoot_pct : null, b.overshoot_pct, (v) => fixed(v, 0)],
-    [html`Settled within 5 % <small>s${atMost(atTested ? job.comparison?.settling_s_asked : null)}</small>`, "settle", stable ? a.setpoint?.settling_s : null, b.setpoint?.settling_s, (v) => significant(v, 2)],
-    ...(known(job.comparison?.mv_peak_asked) ? /** @type {any[]} */ ([[html`MV moved after a step <small>%/${u}${atMost(job.comparison.mv_peak_asked)}</small>`, "mv", stable ? a.setpoint?.mv_peak : null, b.setpoint?.mv_peak, significant]]) : []),
+    [html`Settling time (5 %) <small>s${atMost(atTested ? job.comparison?.settling_s_asked : null)}</small>`, "settle", stable ? a.setpoint?.settling_s : null, b.setpoint?.settling_s, (v) => significant(v, 2)],
+    ...(known(job.comparison?.mv_peak_asked) ? /** @type {any[]} */ ([[html`Largest output move <small>%/${u}${atMost(job.comparison.mv_peak_asked)}</small>`, "mv", stable ? a.setpoint?.mv_peak : null, b.setpoint?.mv_peak, significant]]) : []),
     [html`Load of ${LOAD_PCT} %, IAE <small>${u} s</small>`, "iae", stable ? load(a) : null, load(b), (v) => significant(v, 3)],
     [html`Largest sensitivity Ms ${known(uncertain) && html`<small>± ${msError(uncertain)}</small>`}`, "ms", stable ? a.Ms : null, b.Ms, msText],
-    [html`The plant's gain may grow`, "gm", stable ? a.GM : null, b.GM, (v) => (known(v) ? `× ${fixed(v, 2)}` : "–")],
-    [html`Its dead time may grow by <small>s</small>`, "dm", stable ? dm : null, dmAfter, (v) => significant(v, 3)],
+    [html`Gain margin`, "gm", stable ? a.GM : null, b.GM, (v) => (known(v) ? `× ${fixed(v, 2)}` : "–")],
+    [html`Delay margin <small>s</small>`, "dm", stable ? dm : null, dmAfter, (v) => significant(v, 3)],
     [html`Phase margin <small>°</small>`, "pm", stable ? a.PM_deg : null, b.PM_deg, (v) => fixed(v, 0)],
   ];
   return html`<table class="figures" key="table"><caption class="hidden-words">Before and after, for a set-point step of ${size} ${u}</caption>
@@ -197,7 +197,7 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   const gains = asking === "rollback" ? job.old_gains : job.new_gains;
   const written = gains && `Kp ${significant(gains.Kp)} %/${unit(loop.pv_unit)}, Ti ${significant(gains.Ti)} s${gains.Td ? `, Td ${significant(gains.Td)} s` : ""}${weight(gains)}`;
   const where = `${loop.tag}, node ${loop.controller_node.toString(16)}h channel ${loop.channel}`;
-  const Signed = (/** @type {string} */ action, /** @type {() => void} */ go) => html`<span class="ask" key="ask"><label key="by">Signed <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && signature.value.trim() && !dead) go(); }} /></label>
+  const Signed = (/** @type {string} */ action, /** @type {() => void} */ go) => html`<span class="ask" key="ask"><label key="by">Your name <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && signature.value.trim() && !dead) go(); }} /></label>
     <button key="cancel" onClick=${close}>Cancel</button><button key="go" class="main" disabled=${dead || !signature.value.trim()} onClick=${go}>${action}</button></span>`;
   const mode = rowOf(loop.tag).value?.mode;
   const noTrialIn = mode === "manual" ? "in manual" : mode === "off" ? "off" : "";

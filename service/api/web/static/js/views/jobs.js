@@ -53,7 +53,7 @@ export function JobsView() {
   };
   return html`<div><div class="pagehead" key="head"><h1>Jobs</h1>
       <label class="check">Loop <select value=${loop} onChange=${(/** @type {any} */ e) => setLoop(e.target.value)}><option value="">all</option>${[...(loops.value?.keys() ?? [])].sort().map((tag) => html`<option key=${tag} value=${tag}>${tag}</option>`)}</select></label>
-      <label class="check">Result <select value=${state} onChange=${(/** @type {any} */ e) => setState(e.target.value)}>${STATES.map((each) => html`<option key=${each} value=${each}>${each ? (each === "proposed" ? "waits for a decision" : each.replaceAll("_", " ")) : "all"}</option>`)}</select></label></div>
+      <label class="check">Result <select value=${state} onChange=${(/** @type {any} */ e) => setState(e.target.value)}>${STATES.map((each) => html`<option key=${each} value=${each}>${each ? (each === "proposed" ? "awaiting decision" : each.replaceAll("_", " ")) : "all"}</option>`)}</select></label></div>
     ${problem && html`<p class="refusal" role="alert" key="problem">${problem}</p>`}
     ${!rows ? html`<p class="calm" role="status" key="wait">Asking for the jobs…</p>` : !rows.length ? html`<p class="calm" key="none">There are no such jobs.</p>` : html`<div class="table jobs" key="table"><table>
       <thead><tr><th>Date</th><th>Loop</th><th class="c-by">Asked by</th><th class="c-method">Procedure</th><th>Result</th><th>Kp</th><th>Ti, s</th><th>Ms</th><th class="c-decided">Decided</th></tr></thead>

@@ -25,7 +25,7 @@ export function LogView() {
   }, []);
   return html`<div><div class="pagehead" key="head"><h1>Log</h1><span class="sentence">who changed what, and with which key</span></div>
     ${problem && html`<p class="refusal" role="alert" key="problem">${problem}</p>`}
-    ${!entries ? !problem && html`<p class="calm" role="status" key="wait">Asking for the log…</p>` : !entries.length ? html`<p class="calm" key="none">Nothing was changed yet.</p>` : html`<div class="table" key="table"><table><thead><tr><th>Date</th><th>What</th><th>Loop</th><th>Of</th><th>Key</th><th>Signed</th><th>From</th></tr></thead>
+    ${!entries ? !problem && html`<p class="calm" role="status" key="wait">Asking for the log…</p>` : !entries.length ? html`<p class="calm" key="none">Nothing was changed yet.</p>` : html`<div class="table" key="table"><table><thead><tr><th>Date</th><th>What</th><th>Loop</th><th>Of</th><th>Key</th><th>By</th><th>From</th></tr></thead>
       <tbody>${entries.map((each) => html`<tr key=${each.number}><td title=${each.at}>${when(each.at)}</td><td><b>${each.what.replaceAll("_", " ")}</b></td><td>${each.loop && html`<a class="tag" href=${loopPath(each.loop)}>${each.loop}</a>`}</td><td>${/^[0-9a-f]{12}$/.test(each.subject ?? "") && each.loop ? html`<a href=${jobPath(`/jobs/${each.subject}`)}>job ${each.subject}</a>` : each.subject}</td><td>${each.who}</td><td>${each.said_by}</td><td class="quiet">${each.address}</td></tr>`)}</tbody></table></div>`}
     ${next && html`<p class="foot" key="more"><button onClick=${() => look(String(next), entries ?? [])}>More</button></p>`}</div>`;
 }

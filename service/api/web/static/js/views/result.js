@@ -65,7 +65,7 @@ function Numbers(loop, job) {
   else if (m) rows.push(["model", `K ${significant(m.K)} ${u}/%, T ${significant(m.T_s)} s, dead time ${significant(m.L_s)} s${known(m.zeta) ? `, damping ${significant(m.zeta)}` : ""}`]);
   if (known(m?.fit_pct)) rows.push(["fit", `${fixed(m.fit_pct, 1)} %`]);
   if (job.ultimate) rows.push(["ultimate point", `Ku ${significant(job.ultimate.Ku)} %/${u}, Pu ${significant(job.ultimate.Pu_s)} s`]);
-  if (job.evidence) rows.push(["excitation", `${job.evidence.switches} switches, period ${significant(job.evidence.period_s)} s`], ["not explained", known(job.evidence.residual) ? `${fixed(job.evidence.residual, 2)} times the noise at rest` : "–"]);
+  if (job.evidence) rows.push(["excitation", `${job.evidence.switches} switches, period ${significant(job.evidence.period_s)} s`], ["residual", known(job.evidence.residual) ? `${fixed(job.evidence.residual, 2)} times the noise at rest` : "–"]);
   for (const [name, value] of Object.entries(job.chosen)) rows.push([name, significant(Number(value))]);
   if (job.before) rows.push(["step before", `overshoot ${fixed(job.before.overshoot_pct, 0)} %, ${job.before.settled ? `settled in ${duration(job.before.settling_s)}` : "not settled"}`]);
   if (job.after) rows.push(["step after", `overshoot ${fixed(job.after.overshoot_pct, 0)} %, ${job.after.settled ? `settled in ${duration(job.after.settling_s)}` : "not settled"}`]);

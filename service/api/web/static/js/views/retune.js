@@ -85,7 +85,7 @@ export function RetuneForm({ loop, onClose, onStarted }) {
   const designed = form.method === "fast" || form.method === "setpoint";
   const obstacle = preview?.obstacles.find((/** @type {any} */ each) => !PASSING.includes(each.reason));
   const unsigned = !signature.value.trim();
-  const why = isSilent.value ? "The service is silent." : bad ? bad : obstacle ? "" : unsigned ? "Who signs?" : "";
+  const why = isSilent.value ? "The service is silent." : bad ? bad : obstacle ? "" : unsigned ? "Your name is missing." : "";
   const dead = sending || !!why || !!obstacle;
   const u = unit(loop.pv_unit);
   return html`<section class="card" aria-label="Retune" style=${{ marginTop: "16px" }}>
@@ -103,8 +103,8 @@ export function RetuneForm({ loop, onClose, onStarted }) {
       ${Field("mv_low", "%", loop.mv_limits.low, form, set, problem)}${Field("mv_high", "%", loop.mv_limits.high, form, set, problem)}
       ${Field("pv_low", u, loop.pv_limits.low, form, set, problem)}${Field("pv_high", u, loop.pv_limits.high, form, set, problem)}
       ${Field("sp_deviation", u, loop.sp_deviation, form, set, problem)}
-      ${designed && html`<label class="check"><input type="checkbox" checked=${!!form.derivative} onChange=${set("derivative")} /> derivative, where it pays</label>`}
-      ${designed && html`<label class="field"><span>The best for</span><select class="wide" value=${form.aim ?? "balanced"} onChange=${set("aim")}>
+      ${designed && html`<label class="check"><input type="checkbox" checked=${!!form.derivative} onChange=${set("derivative")} /> allow derivative (PID)</label>`}
+      ${designed && html`<label class="field"><span>Tuning objective</span><select class="wide" value=${form.aim ?? "balanced"} onChange=${set("aim")}>
         <option value="balanced">set-point and load alike</option><option value="setpoint">set-point steps</option><option value="load">load disturbances</option><option value="no_overshoot">both, without overshoot</option></select></label>`}
       ${designed && Field("settling_s", "s", null, form, set, problem)}
       ${designed && Field("mv_peak", `% per ${u}`, null, form, set, problem)}
@@ -113,7 +113,7 @@ export function RetuneForm({ loop, onClose, onStarted }) {
     </div>`}
     ${preview?.obstacles.map((/** @type {any} */ each) => html`<div class="refusal" key=${each.reason}><p>${asNamed(each.detail)} <span class="advice">${each.advice}</span> ${each.job && html`<a href=${jobPath(each.job)}>to that job</a>`}</p></div>`)}
     ${problem && html`<div class="refusal" role="alert" key="problem"><p>${asNamed(problem.message)} <span class="advice">${problem.advice}</span> ${problem.job && html`<a href=${jobPath(problem.job)}>to that job</a>`}</p></div>`}
-    <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && !dead) void start(); }} /></label>
+    <div class="foot" key="foot"><label class="left">Your name <input type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && !dead) void start(); }} /></label>
       <span class="quiet" role="status">${why}</span>
       <button class="main" disabled=${dead} onClick=${start}>${form.dry_run ? "Rehearse" : "Retune"} ${loop.tag}</button></div>
   </section>`;
@@ -128,7 +128,7 @@ function Field(name, u, usual, form, set, problem) {
 /** How the form names the fields of a request. @type {Record<string, string>} */
 const LABELS = {
   amplitude_pct: "Relay up by", mv_low: "MV not below", mv_high: "MV not above", pv_low: "Abort below", pv_high: "Abort above",
-  sp_deviation: "SP step", settling_s: "Settled within 5 % in", mv_peak: "MV moved at most by",
+  sp_deviation: "SP step", settling_s: "Settling time (5 %), at most", mv_peak: "Largest output move",
 };
 
 /** A message of the service, with the fields named as the form names them. @param {string | null | undefined} text */

@@ -120,7 +120,7 @@ function Form() {
     ${preview && html`<div key="what" class="explain">${preview.summary.map((/** @type {string} */ line) => html`<p key=${line}>${line}</p>`)}</div>`}
     ${preview?.loops.filter((/** @type {any} */ each) => !each.would_start).map((/** @type {any} */ each) => html`<p class="note" key=${each.loop}><b>${each.loop}</b> ${each.obstacles[0]?.detail}. ${each.obstacles[0]?.advice}</p>`)}
     ${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice}</span></p>`}
-    <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && !dead) void start(); }} /></label>
+    <div class="foot" key="foot"><label class="left">Your name <input type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && !dead) void start(); }} /></label>
       <span class="quiet" role="status">${bad}</span>
       <button class="main" disabled=${dead} onClick=${start}>${preview ? `Retune ${preview.would_start} ${preview.would_start === 1 ? "loop" : "loops"}` : "Retune"}</button></div></section>`;
 }

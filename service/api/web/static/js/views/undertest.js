@@ -12,7 +12,7 @@ export function UnderTest({ loop, live, job }) {
   const stop = stopWords(live);
   const stopping = stop !== "";
   return html`<section class="card undertest" id="under-test" tabindex="-1" aria-label="Under test">
-    <div class="split" key="top"><h2 class="title">${live.state === "queued" ? "Waits for its turn" : "Under test"}</h2>
+    <div class="split" key="top"><h2 class="title">${live.state === "queued" ? "Queued" : "Under test"}</h2>
       <span>${stopping ? stop : live.remaining_plant_time_s !== null && !isSilent.value ? html`about <b>${duration(live.remaining_plant_time_s)}</b> left <span class="quiet">of plant time, ${duration(live.plant_time_s)} so far</span>` : ""}</span></div>
     ${Progress(live.progress, stopping)}
     ${job ? Stages(job, loop.pv_unit, live.stage ?? "") : html`<p class="quiet" key="asking">Asking for the stages…</p>`}

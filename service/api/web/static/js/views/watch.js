@@ -34,7 +34,7 @@ export function Watch({ loop, job, onChanged }) {
   return html`<section class="card" aria-label="Watch after acceptance"><h2 class="title" key="t">Watched since it was accepted</h2>
     <p key="words" role="status" class=${bad ? "refusal" : ""}>${w.words.replaceAll("+-", "±")}</p>
     ${w.changes.length > 0 && html`<table class="figures" key="changes"><caption class="hidden-words">The changes that were compared with the model</caption>
-      <thead><tr><th>Change</th><th class="num">set-point by, ${u}</th><th>it</th><th class="num">not explained, × noise</th><th class="num">Ms then</th></tr></thead>
+      <thead><tr><th>Change</th><th class="num">set-point by, ${u}</th><th>it</th><th class="num">residual, × noise</th><th class="num">Ms then</th></tr></thead>
       <tbody>${w.changes.map((/** @type {any} */ each) => html`<tr key=${each.at_s}><td>${when(new Date(each.at_s * 1000).toISOString())}</td><td class="num">${each.size ? significant(each.size, 3) : "load"}</td><td>${STATES[each.state] ?? each.state}${each.load ? ", or a step of the load" : ""}</td><td class="num">${fixed(each.residual, 1)}</td><td class="num">${known(each.instead?.Ms) ? ms(each.instead.Ms) : ""}</td></tr>`)}</tbody></table>`}
     ${w.instead && html`<p class="note" key="instead">What fits instead: ${w.instead.words.replaceAll("+-", "±")}. The accepted gains have Ms <b>${w.instead.Ms < 100 ? ms(w.instead.Ms) : "over 100"}</b> then.${bad ? " The old gains can be put back above." : ""}</p>`}
     <p class="quiet" key="how">${w.going_on ? `${w.changes.length} of ${w.wanted} changes were compared. ${w.trouble ? "" : byItself(w)}` : (ENDS[w.end] ?? "")}</p>
