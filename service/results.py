@@ -284,13 +284,13 @@ class PerformanceView(Figures):
 class ComparisonView(Figures):
     """The present and the new gains on the identified model, and whether the new gains meet the request better."""
 
-    before: PerformanceView = Field(description="Performance of the present gains")
-    after: PerformanceView = Field(description="Performance of the new gains")
+    previous: PerformanceView = Field(description="Performance of the present gains")
+    new: PerformanceView = Field(description="Performance of the new gains")
     Ms_asked: float = Field(description="Requested upper bound of Ms", examples=[1.6])
     settling_s_asked: float | None = Field(
         default=None,
         description="Longest settling time asked for, after a set-point step into 5 %, s; null: none was. What the "
-        "gains reach is in `before` and `after`, setpoint.settling_s",
+        "gains reach is in `previous` and `new`, setpoint.settling_s",
         examples=[300.0],
     )
     mv_peak_asked: float | None = Field(
@@ -302,10 +302,10 @@ class ComparisonView(Figures):
         default=None, description="Largest noise gain asked for, percent per PV unit; null: none was"
     )
     criterion: str = Field(description="The criterion J that the method minimises", examples=["criterion (7)"])
-    J_before: float | None = Field(
+    J_previous: float | None = Field(
         description="J of the present gains; null: the loop is not stable, or an offset remains"
     )
-    J_after: float | None = Field(description="J of the new gains; null: an offset remains")
+    J_new: float | None = Field(description="J of the new gains; null: an offset remains")
     gain: bool = Field(
         description="True when the new gains meet a robustness bound that the present gains violate, or when J falls "
         "by more than 5 %. If false, nothing is proposed unless propose_anyway is set"
@@ -383,7 +383,7 @@ class KnowledgeView(Figures):
     )
     source: FindingSource = Field(
         description="operation: set-point changes of normal operation; job: a test; trial: operation or a test, whose "
-        "gains were then tried on the loop and accepted"
+        "gains were then tested on the loop and accepted"
     )
     source_text: str = Field(description="The same in words", examples=["3 set-point changes of normal operation"])
     changes: int | None = Field(description="Number of set-point changes of normal operation; null: it was a test")
@@ -396,8 +396,8 @@ class KnowledgeView(Figures):
         description="The gains that were proposed then, or found no better; null: none, or they are in effect"
     )
     Ms_asked: float | None = Field(description="Upper bound of Ms for which these were designed", examples=[1.6])
-    agreeing: int = Field(description="Number of further findings that agree", examples=[2])
-    older_plant: str | None = Field(
+    consistent: int = Field(description="Number of further findings that agree", examples=[2])
+    superseded: str | None = Field(
         description="Why the latest earlier finding that does not agree is of an older plant; null: there is none"
     )
 
@@ -406,11 +406,11 @@ class _Result(Figures):
     """The fields of the results of both procedures. A field is null if the retune did not get that far."""
 
     method: str = Field(description="Method that computes the gains", examples=["fast"])
-    chosen: dict[str, float] = Field(
+    design: dict[str, float] = Field(
         default_factory=dict, description="Design parameters of the method in effect; the names carry the units"
     )
     ultimate: UltimateView | None = Field(default=None, description="The ultimate point")
-    old_gains: GainsView | None = Field(default=None, description="The gains before the test")
+    previous_gains: GainsView | None = Field(default=None, description="The gains before the test")
     new_gains: GainsView | None = Field(default=None, description="The gains proposed or rehearsed, or found no better")
     comparison: ComparisonView | None = Field(
         default=None, description="Comparison of the present and the new gains on the model"
@@ -419,7 +419,9 @@ class _Result(Figures):
     predicted: PredictedView | None = Field(
         default=None, description="Predicted performance of the new gains on the model"
     )
-    after: StepView | None = Field(default=None, description="Measured set-point step with the new gains, from rest")
+    step_after: StepView | None = Field(
+        default=None, description="Measured set-point step with the new gains, from rest"
+    )
     notes: list[str] = Field(default_factory=list, description="Notes for the operator")
 
 
@@ -428,8 +430,8 @@ class FastResult(_Result):
 
     procedure: Literal["fast"] = "fast"
     model: TransferModelView | None = None
-    predicted_before: PredictedView | None = Field(
-        default=None, description="Predicted performance of the old gains; null: the loop is not stable with them"
+    predicted_previous: PredictedView | None = Field(
+        default=None, description="Predicted performance of the previous gains; null: the loop is not stable with them"
     )
     model_from: str | None = Field(
         default=None,
@@ -438,7 +440,9 @@ class FastResult(_Result):
                   "new gains"],
     )  # fmt: skip
     evidence: EvidenceView | None = Field(default=None, description="Evidence from the record")
-    known_before: KnownMsView | None = Field(default=None, description="Ms of the old gains; null: there is no record")
+    known_previous: KnownMsView | None = Field(
+        default=None, description="Ms of the previous gains; null: there is no record"
+    )
     verification: VerificationView | None = Field(default=None, description="Measured step that verifies the model")
 
 
@@ -447,7 +451,7 @@ class FiveStageResult(_Result):
 
     procedure: Literal["five-stage"] = "five-stage"
     model: ModelView | None = None
-    before: StepView | None = Field(default=None, description="Measured set-point step with the old gains")
+    step_before: StepView | None = Field(default=None, description="Measured set-point step with the previous gains")
 
 
 Result = Annotated[FastResult | FiveStageResult, Field(discriminator="procedure")]

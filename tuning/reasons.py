@@ -63,7 +63,7 @@ class Reason(StrEnum):
     BUS_LOST = "bus_lost"
     GATEWAY_LOST = "gateway_lost"
     NODE_NOT_OPERATIONAL = "node_not_operational"
-    DEVICE_WENT_BACK = "device_went_back"
+    SESSION_ENDED_BY_DEVICE = "session_ended_by_device"
     RESTORE_UNCONFIRMED = "restore_unconfirmed"
     COMPUTATION_LIMIT = "computation_limit"
     COMPUTATION_LOST = "computation_lost"
@@ -148,16 +148,17 @@ ADVICE: dict[Reason, str] = {
     Reason.SETPOINT_CHANGED: "Somebody else moved the set-point during the test; agree on the time and repeat.",
     Reason.MODE_CHANGED: "Somebody else changed the mode during the test; agree on the time and repeat.",
     Reason.GAINS_CHANGED: "Somebody else tried other gains during the test; agree on the time and repeat.",
-    Reason.NODE_LOST: "The device fell silent: check power and cable; it goes home by itself.",
+    Reason.NODE_LOST: "The device sends no data: check power and cable; it restores the loop by itself.",
     Reason.NODE_NOT_ANSWERING: "The device sends heartbeats and answers no request, so it has power and a cable: see "
     "whether its SDO server hangs or is kept busy by another master, or the bus loses frames; start its program anew "
-    "when the loop permits. It goes home by itself.",
-    Reason.BUS_LOST: "Check the CAN interface, its name and whether it is up; the device goes home by itself.",
+    "when the loop permits. It restores the loop by itself.",
+    Reason.BUS_LOST: "Check the CAN interface, its name and whether it is up; the device restores the loop by itself.",
     Reason.GATEWAY_LOST: "The gateway of the loop alone reaches it: see that its service runs and reaches the "
     "database. What is under test there goes on, or ends safely by itself.",
     Reason.NODE_NOT_OPERATIONAL: "The node does not control: start it (NMT) and look at the loop; Loopwright looks at "
     "it again by itself, and sends no NMT command.",
-    Reason.DEVICE_WENT_BACK: "The controller ended the test by itself (lease, heartbeat): check this machine's load.",
+    Reason.SESSION_ENDED_BY_DEVICE: "The controller ended the test by itself (lease, heartbeat): check the load of "
+    "this machine.",
     Reason.RESTORE_UNCONFIRMED: "The loop could not be read back after the test: look at the controller NOW.",
     Reason.COMPUTATION_LIMIT: "Look for a number in the model or the options that is far from any plant's (gain, time "
     "constants, dead time against T95 and sample time), or have an administrator permit more by the option of "

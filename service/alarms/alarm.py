@@ -23,7 +23,7 @@ class AlarmKind(StrEnum):
     NO_DATA = "no_data"
     PV_OUTSIDE_LIMITS = "pv_outside_limits"
     FOREIGN_TEST = "foreign_test"
-    GATEWAY_SILENT = "gateway_silent"
+    GATEWAY_OFFLINE = "gateway_offline"
     SUSPECT_GAINS = "suspect_gains"
     ROLLED_BACK = "rolled_back"
     MODEL_MISMATCH = "model_mismatch"
@@ -55,7 +55,7 @@ RULES: dict[AlarmKind, KindRule] = {
     AlarmKind.NO_DATA: KindRule(2, 3.0, 3.0, False),
     AlarmKind.PV_OUTSIDE_LIMITS: KindRule(2, 3.0, 3.0, False),
     AlarmKind.FOREIGN_TEST: KindRule(2, 5.0, 3.0, False),
-    AlarmKind.GATEWAY_SILENT: KindRule(2, 10.0, 3.0, False),
+    AlarmKind.GATEWAY_OFFLINE: KindRule(2, 10.0, 3.0, False),
     AlarmKind.SUSPECT_GAINS: KindRule(1, 0.0, 0.0, True),
     AlarmKind.ROLLED_BACK: KindRule(2, 0.0, 0.0, True),
     AlarmKind.MODEL_MISMATCH: KindRule(2, 0.0, 0.0, True),
@@ -87,7 +87,7 @@ class Alarm(BaseModel):
     text: str = Field(description="What is wrong", examples=["PV is above its limit of 51 degC"])
     advice: str = Field(description="What the operator should do")
     since: str = Field(description="When it began: UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
-    host: str = Field(description="Name of the gateway that has the loop or the bus", examples=["local"])
+    gateway: str = Field(description="Name of the gateway that has the loop or the bus", examples=["local"])
     loop: str | None = Field(
         description="Tag of the loop; null: it is about a bus, a node or a gateway", examples=["TIC-101"]
     )

@@ -31,7 +31,7 @@ _NEVER_HEARD_OF_T95 = 0.2
 _NO_ANSWER = (JobState.FAILED, JobState.INTERRUPTED)
 _BUS_ADVICE = (
     "Check the interface and the cable. The bus is opened again every 2 s; controllers whose tests ran on it bring "
-    "their loops home by themselves."
+    "their loops by themselves."
 )
 _EAR_ADVICE = "It is started again by itself. Tests go on; what the loops do is not seen until then."
 _GATEWAY_ADVICE = f"{ADVICE[Reason.GATEWAY_LOST]} What alarms there are there is not known here meanwhile."
@@ -170,7 +170,7 @@ def _tests(known: AlarmFacts) -> Iterator[Condition]:
         )  # fmt: skip
     for job in known.unconfirmed:
         text = NOT_RESTORED_TEXT
-        if job.looked_after:
+        if job.monitored:
             advice = (
                 "Look at the controller now. It is looked at again until the loop is as before. " + _UNTIL_ACKNOWLEDGED
             )
@@ -230,9 +230,9 @@ def _watches(known: AlarmFacts) -> Iterator[Condition]:
                 "Look at the sensor and the loop now: it is in automatic on this PV unless you put it in manual. "
                 f"Nothing was written to it, and the watch puts no gains back. {_UNTIL_ACKNOWLEDGED}"
             )
-        elif trouble.put_back:
+        elif trouble.rolled_back:
             kind, since_s = AlarmKind.ROLLED_BACK, _seconds(trouble.at)
-            text = f"The old gains were put back by the watch: {trouble.text}"
+            text = f"The previous gains were put back by the watch: {trouble.text}"
             advice = (
                 f"Look at the loop, and at what was found of the model, before it is retuned. {_UNTIL_ACKNOWLEDGED}"
             )
@@ -252,7 +252,7 @@ def _mismatch(watch: AcceptanceWatch) -> str:
 
 
 def _why_not(trouble: Trouble) -> str:
-    return "" if trouble.why_not is None else f"They were not put back by the watch: {trouble.why_not}."
+    return "" if trouble.reason is None else f"They were not put back by the watch: {trouble.reason}."
 
 
 def _gateways(known: AlarmFacts) -> Iterator[Condition]:
@@ -260,7 +260,7 @@ def _gateways(known: AlarmFacts) -> Iterator[Condition]:
         if gateway.silent:
             waited_from_s = max(gateway.waited_from_s, gateway.last_s or 0.0)
             yield Condition(
-                alarm_id(AlarmKind.GATEWAY_SILENT, gateway.name), AlarmKind.GATEWAY_SILENT, f"gateway {gateway.name}",
+                alarm_id(AlarmKind.GATEWAY_OFFLINE, gateway.name), AlarmKind.GATEWAY_OFFLINE, f"gateway {gateway.name}",
                 f"Gateway {gateway.name} does not answer", _GATEWAY_ADVICE, gateway.name, loops=gateway.loops,
                 since_s=gateway.last_s, from_s=waited_from_s,
             )  # fmt: skip
@@ -273,7 +273,7 @@ def _buses(known: AlarmFacts) -> Iterator[Condition]:
         why = bus.why.replace(f"bus '{bus.url}' ", "it ", 1)
         text, advice = f"Bus {bus.url} is down: {why}", _BUS_ADVICE
         if bus.why.startswith("the listening process"):
-            text, advice = f"Bus {bus.url} is not heard: {bus.why}", _EAR_ADVICE
+            text, advice = f"No data of bus {bus.url}: {bus.why}", _EAR_ADVICE
         yield Condition(
             alarm_id(AlarmKind.BUS_DOWN, known.host, bus.url), AlarmKind.BUS_DOWN, bus.url, text, advice, known.host,
             loops=_tags(loop.config for loop in known.loops if loop.config.bus == bus.url),
@@ -333,7 +333,7 @@ def _no_data(host: str, loop: LoopFacts, up_s: float) -> Iterator[Condition]:
     advice = "Check power and cable of controller and plant I/O, and that both nodes are operational."
     if heard is None:
         patience_s = max(3.0, _NEVER_HEARD_OF_T95 * config.t95_s)
-        text = "No data since the bus is heard"
+        text = "No data since the bus is up"
         yield _condition(AlarmKind.NO_DATA, host, config, text, advice, since_s=up_s, from_s=up_s, on_s=patience_s)
     elif heard.silent:
         from_s = max(heard.at_s, up_s)

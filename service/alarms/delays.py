@@ -80,6 +80,6 @@ def _alarm(found: Condition, since: str) -> Alarm:
     rule = RULES[found.kind]
     return Alarm(
         id=found.id, priority=rule.priority, kind=found.kind, subject=found.subject, text=found.text,
-        advice=found.advice, since=since, host=found.host, loop=found.loop, loops=list(found.loops), job=found.job,
+        advice=found.advice, since=since, gateway=found.host, loop=found.loop, loops=list(found.loops), job=found.job,
         unacknowledged=rule.to_acknowledge, acknowledged=None,
     )  # fmt: skip

@@ -15,7 +15,7 @@ _KNOWN_EVERYWHERE = frozenset(
         AlarmKind.ROLLED_BACK,
         AlarmKind.MODEL_MISMATCH,
         AlarmKind.TEST_FAILED,
-        AlarmKind.GATEWAY_SILENT,
+        AlarmKind.GATEWAY_OFFLINE,
     }
 )
 """Kinds that every gateway finds in the database by itself."""
@@ -23,7 +23,7 @@ _KNOWN_EVERYWHERE = frozenset(
 
 def only_known_here(alarms: Iterable[Alarm], host: str) -> list[Alarm]:
     """Returns the alarms that the gateway `host` alone can know, which it has to say to the others."""
-    return [alarm for alarm in alarms if alarm.host == host and alarm.kind not in _KNOWN_EVERYWHERE]
+    return [alarm for alarm in alarms if alarm.gateway == host and alarm.kind not in _KNOWN_EVERYWHERE]
 
 
 def merged(own: Iterable[Alarm], known: AlarmFacts) -> list[Alarm]:
@@ -32,7 +32,7 @@ def merged(own: Iterable[Alarm], known: AlarmFacts) -> list[Alarm]:
     What a gateway has said last stays until it counts as one that does not answer: from then on nothing is known.
     """
     found = {alarm.id: alarm for alarm in own if alarm.id not in known.acknowledged}
-    silent = {alarm.host for alarm in found.values() if alarm.kind is AlarmKind.GATEWAY_SILENT}
+    silent = {alarm.gateway for alarm in found.values() if alarm.kind is AlarmKind.GATEWAY_OFFLINE}
     for gateway in known.gateways:
         for alarm in gateway.alarms:
             if gateway.name not in silent and alarm.id not in known.acknowledged:

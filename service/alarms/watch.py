@@ -88,7 +88,7 @@ class AlarmWatch:
     def counts(self) -> dict[Priority, int]:
         """Returns how many alarms of each priority this gateway has, as they were seen last; those of others are left
         out, so that the sum over all gateways has each once."""
-        found = Counter(alarm.priority for alarm in self.latest or () if alarm.host == self._store.host)
+        found = Counter(alarm.priority for alarm in self.latest or () if alarm.gateway == self._store.host)
         return {priority: found[priority] for priority in PRIORITIES}
 
     def only_known_here(self) -> list[Alarm]:
@@ -120,7 +120,7 @@ class AlarmWatch:
                 f"{RULES[alarm.kind].off_s:g} s after its cause has gone. {alarm.subject}: {alarm.text}"
             )
         row = AlarmAcknowledgementRow(
-            alarm_id=alarm.id, priority=alarm.priority, kind=alarm.kind.value, host=alarm.host, loop=alarm.loop,
+            alarm_id=alarm.id, priority=alarm.priority, kind=alarm.kind.value, host=alarm.gateway, loop=alarm.loop,
             job_id=None if alarm.job is None else alarm.job.rpartition("/")[2],
             text=alarm.text, since=alarm.since, by=by, at=now(),
         )  # fmt: skip
@@ -140,7 +140,7 @@ def _acknowledged(row: AlarmAcknowledgementRow) -> Alarm:
     loops = [] if row.loop is None else [row.loop]
     return Alarm(
         id=row.alarm_id, priority=_PRIORITIES[row.priority], kind=AlarmKind(row.kind), subject=row.loop or row.host,
-        text=row.text, advice="Nothing is left to do: it was acknowledged.", since=row.since, host=row.host,
+        text=row.text, advice="Nothing is left to do: it was acknowledged.", since=row.since, gateway=row.host,
         loop=row.loop, loops=loops, job=None if row.job_id is None else f"/jobs/{row.job_id}", unacknowledged=False,
         acknowledged=Acknowledgement(by=row.by, at=row.at),
     )  # fmt: skip

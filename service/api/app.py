@@ -50,7 +50,7 @@ from loopwright.service.api.job_views import (
     LiveErrorView,
     LiveView,
     LoopDetail,
-    NotHomeView,
+    RestoreUnconfirmedView,
     SamplesView,
     job_view,
     live_view,
@@ -60,7 +60,7 @@ from loopwright.service.api.job_views import (
 from loopwright.service.api.paging import LARGEST, LINK, Cursor, Limit, more
 from loopwright.service.api.routes import add, name_of
 from loopwright.service.api.samples import Reading, csv_text, json_text, parts
-from loopwright.service.api.watch_views import WatchView
+from loopwright.service.api.watch_views import MonitoringView
 from loopwright.service.api.web.compressed import takes_gzip
 from loopwright.service.api.web.pages import Pages
 from loopwright.service.execution.computing.pool import Pool
@@ -200,7 +200,7 @@ def create_app(
     )
     def get_loop(tag: Tag) -> LoopDetail:
         config, host = jobs.directory.owner(tag)
-        not_home = next(iter(jobs.aftercare.not_home(tag)), None)
+        unconfirmed = next(iter(jobs.aftercare.unconfirmed(tag)), None)
         elsewhere = host != jobs.store.host
         present, away = there(config, host) if elsewhere else here(tag)
         last = others.values(tag, host) if elsewhere else own.values(tag, time.time())
@@ -220,12 +220,12 @@ def create_app(
             **dict(shown),
             live=present,
             live_error=away,
-            last_heard=None if present is not None else gateways.last_heard(last),
-            not_confirmed_home=NotHomeView.of(not_home) if not_home else None,
+            last_data=None if present is not None else gateways.last_data(last),
+            restore_unconfirmed=RestoreUnconfirmedView.of(unconfirmed) if unconfirmed else None,
             not_acknowledged=jobs.aftercare.not_acknowledged(tag),
             disturbed_by=jobs.directory.disturbed_by(tag),
             knowledge=jobs.knowledge.of(tag, gains),
-            watch=None if watched is None else WatchView.of(watched, JobState.ACCEPTED),
+            monitoring=None if watched is None else MonitoringView.of(watched, JobState.ACCEPTED),
         )
 
     @app.post(
@@ -376,13 +376,13 @@ def create_app(
         job_id: JobId, response: Response, decision: Annotated[AcceptDecision | None, Body()] = None
     ) -> JobView:
         given = decision or AcceptDecision()
-        row = jobs.decisions.accept(job_id, signed_by(given), given.roll_back_by_itself)
+        row = jobs.decisions.accept(job_id, signed_by(given), given.auto_rollback)
         return decided(row, JobState.ACCEPTED, response)
 
     @app.post(
         "/jobs/{job_id}/rollback",
         tags=["jobs"],
-        summary="Decline the proposal, or write the old gains back after it was accepted",
+        summary="Decline the proposal, or write the previous gains back after it was accepted",
         responses={**not_yet, **problems.responses(404, 409, 422, 503)},
     )
     def roll_back_job(

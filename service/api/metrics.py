@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 from loopwright.service.alarms.alarm import Priority
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.states.job_state import ACTIVE, JobState
-from loopwright.service.store import looked_after
+from loopwright.service.store import unconfirmed_restorations
 from loopwright.service.store.live_jobs import latest_tests
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import JobRow
@@ -67,14 +67,14 @@ class _OfTheStore(Collector):
         yield retries
         up = GaugeMetricFamily("loopwright_database_up", "1: the database answers")
         try:
-            jobs, waiting, not_home = self._jobs(), self._waiting(), self._not_home()
+            jobs, waiting, unconfirmed = self._jobs(), self._waiting(), self._not_home()
         except SQLAlchemyError:
             up.add_metric([], 0)
         else:
             up.add_metric([], 1)
             yield jobs
             yield waiting
-            yield not_home
+            yield unconfirmed
         yield up
 
     def _jobs(self) -> Metric:
@@ -100,8 +100,10 @@ class _OfTheStore(Collector):
 
     def _not_home(self) -> Metric:
         with Session(self._store.engine) as session:
-            count = looked_after.count(session, self._store.host)
-        found = GaugeMetricFamily("loopwright_loops_looked_after", "Loops not confirmed home after a job")
+            count = unconfirmed_restorations.count(session, self._store.host)
+        found = GaugeMetricFamily(
+            "loopwright_loops_restore_unconfirmed", "Loops whose restoration after a job is not confirmed"
+        )
         found.add_metric([], count)
         return found
 

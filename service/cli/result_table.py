@@ -41,16 +41,16 @@ class ShownResult(BaseModel):
 
     model_config = ConfigDict(from_attributes=True)
 
-    old_gains: GainsView | None = None
+    previous_gains: GainsView | None = None
     new_gains: GainsView | None = None
-    before: StepView | None = None
-    after: StepView | None = None
+    step_before: StepView | None = None
+    step_after: StepView | None = None
     comparison: ComparisonView | None = None
     predicted: PredictedView | None = None
-    predicted_before: PredictedView | None = None
+    predicted_previous: PredictedView | None = None
     model: ModelView | TransferModelView | None = None
     model_from: str | None = None
-    tried: bool | None = None
+    tested_on_loop: bool | None = None
     evidence: EvidenceView | None = None
     verification: VerificationView | None = None
     ultimate: UltimateView | None = None
@@ -65,7 +65,7 @@ def result_table(
     heading_new: what the new gains are called.
     """
     table = Table(title=title)
-    for heading in ("", "before", heading_new, "unit"):
+    for heading in ("", "previous", heading_new, "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
     for label, before, after, unit in _figures(shown, pv_unit, mv_unit):
         if before not in _NOTHING or after not in _NOTHING:
@@ -86,16 +86,16 @@ def _figures(job: ShownResult, pv_unit: str, mv_unit: str) -> Iterator[tuple[str
     per = f"{mv_unit} per {pv_unit}"
     if job.new_gains is not None:
         for name, unit in (("Kp", f"{per} (ISA)"), ("Ti", "s"), ("Td", "s")):
-            yield f"gain {name}", figure(job.old_gains, name), figure(job.new_gains, name), unit
-        if weighted(job.old_gains, job.new_gains):
-            yield "set-point weight b", figure(job.old_gains, "b"), figure(job.new_gains, "b"), ""
-    if job.before or job.after:
+            yield f"gain {name}", figure(job.previous_gains, name), figure(job.new_gains, name), unit
+        if weighted(job.previous_gains, job.new_gains):
+            yield "set-point weight b", figure(job.previous_gains, "b"), figure(job.new_gains, "b"), ""
+    if job.step_before or job.step_after:
         for label, name, unit in (
             ("measured IAE", "IAE", f"{pv_unit} s"),
             ("measured overshoot", "overshoot_pct", "%"),
             ("measured settling", "settling_s", "s"),
         ):
-            yield label, figure(job.before, name), figure(job.after, name), unit
+            yield label, figure(job.step_before, name), figure(job.step_after, name), unit
     for label, was, now, unit in _predicted(job, pv_unit, mv_unit):
         yield f"predicted {label}", was, now, unit
     for label, value, unit in (*_model(job.model, pv_unit, mv_unit), *_certainty(job, mv_unit)):
@@ -114,8 +114,8 @@ def _predicted(job: ShownResult, pv_unit: str, mv_unit: str) -> Iterator[tuple[s
     """Yields lines of the table: label, before, after, unit."""
     compared = job.comparison
     if compared is None:
-        earlier = job.predicted_before
-        for label, name, unit in _PREDICTED if earlier or not job.after else _MARGINS:
+        earlier = job.predicted_previous
+        for label, name, unit in _PREDICTED if earlier or not job.step_after else _MARGINS:
             yield label, "" if earlier is None else figure(earlier, name), figure(job.predicted, name), unit
         return
     for label, part, name, unit in (
@@ -136,11 +136,11 @@ def _predicted(job: ShownResult, pv_unit: str, mv_unit: str) -> Iterator[tuple[s
         elif name == "mv_peak":  # a row for who asked for it
             continue
         shown = []
-        for each in (compared.before, compared.after):
+        for each in (compared.previous, compared.new):
             of = getattr(each, part) if part else each
             shown.append(cell(getattr(of, name)) if each.stable else "unstable")
         yield label, shown[0], shown[1], unit
-    yield "J, the cost minimised", cell(compared.J_before), cell(compared.J_after), ""
+    yield "J, the cost minimised", cell(compared.J_previous), cell(compared.J_new), ""
 
 
 def _model(model: ModelView | TransferModelView | None, pv_unit: str, mv_unit: str) -> Iterator[tuple[str, str, str]]:
@@ -193,8 +193,8 @@ def _of_ms(difference: float | None) -> str:
 def _certainty(job: ShownResult, mv_unit: str) -> Iterator[tuple[str, str, str]]:
     """Yields lines of the table on how certain the result of fast is: label, value, unit."""
     found, step = job.evidence, job.verification
-    if job.tried is False:
-        yield "tried on the loop", "never", ""
+    if job.tested_on_loop is False:
+        yield "tested on the loop", "never", ""
     if found is not None:
         yield "uncertainty of Ms", _of_ms(found.uncertainty), "(2 std. dev.)"
         yield "Ms, other models", _of_ms(found.ambiguity), "(max. diff.)"

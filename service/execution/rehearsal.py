@@ -429,9 +429,9 @@ def _designing(
 def _asked(method: str, model: Model | None, options: dict[str, Any]) -> DesignOptions | Options:
     """Raises Refused."""
     if method == FAST:
-        return FastOptions(**{"Ms" if name == "ms" else name: value for name, value in options.items()})
+        return FastOptions(**options)
     if method == SETPOINT:
-        return DesignOptions(**{"Ms" if name == "ms" else name: value for name, value in options.items()})
+        return DesignOptions(**options)
     return Options(method=method, model=_entered(model), **options)
 
 
@@ -469,7 +469,7 @@ def loop_on(model: Model, facts: Facts, mode: Mode) -> RehearsedLoop:
 def _loop_of(plant: SimulatedProcess, facts: Facts, mode: Mode) -> RehearsedLoop:
     span = 1e9
     settings = Settings(facts.mv_low, facts.mv_high, 0.0, pv_low=-span, pv_high=span, reverse=facts.reverse)
-    channel = Channel(facts.sample_time_s, settings, _parameters(facts.old_gains), 0.0, int(mode), 0.0)
+    channel = Channel(facts.sample_time_s, settings, _parameters(facts.previous_gains), 0.0, int(mode), 0.0)
     return RehearsedLoop(plant, channel, facts.sample_time_s)
 
 

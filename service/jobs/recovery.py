@@ -52,7 +52,7 @@ class Recovery:
         if safe is not None and safe.state is not None:
             columns["restored"] = state_json(safe.state)
         elif safe is not None:
-            columns["look_after"] = True
+            columns["restore_unconfirmed"] = True
         if safe is not None and safe.held:
             columns |= {"reason": Reason.BAD_SAMPLE, "false_pv": True}
             columns["detail"] = f"{FALSE_PV_WORDS}, and was cut off by the end of the service: {_loop_words(safe)}"

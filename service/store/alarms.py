@@ -52,7 +52,7 @@ class UnconfirmedJob:
     """A test at whose end the loop was not confirmed to be as before, and that nobody has acknowledged.
 
     at: when it ended: UTC, ISO 8601.
-    looked_after: whether the loop is still looked at until it is as before.
+    monitored: whether the loop is still looked at until it is as before.
     """
 
     id: str
@@ -60,7 +60,7 @@ class UnconfirmedJob:
     host: str
     at: str
     reason: Reason | None
-    looked_after: bool
+    monitored: bool
 
 
 def alarm_id(*parts: str) -> str:
@@ -76,10 +76,10 @@ def unconfirmed(store: Store) -> list[UnconfirmedJob]:
     wanted = (
         select(
             JobRow.id, JobRow.loop, JobRow.host, func.coalesce(JobRow.ended_at, JobRow.created_at), JobRow.reason,
-            JobRow.look_after,
+            JobRow.restore_unconfirmed,
         )
         .where(
-            or_(JobRow.reason == Reason.RESTORE_UNCONFIRMED, JobRow.look_after.is_(True)),
+            or_(JobRow.reason == Reason.RESTORE_UNCONFIRMED, JobRow.restore_unconfirmed.is_(True)),
             JobRow.dry_run.is_(False),
             ~signed.exists(),
         )
@@ -150,4 +150,4 @@ def _add(session: Session, row: AlarmAcknowledgementRow) -> None:
     session.add(row)
     session.flush()
     before = {"priority": row.priority, "kind": row.kind, "text": row.text, "since": row.since, "job": row.job_id}
-    audit.record(session, "acknowledge_alarm", row.alarm_id, before=before, loop=row.loop, said_by=row.by)
+    audit.record(session, "acknowledge_alarm", row.alarm_id, before=before, loop=row.loop, by=row.by)

@@ -54,13 +54,13 @@ def put_back(session: Session, job: JobRow) -> None:
     """As `rolled_back`, for the rollback of a watch by itself, which nobody has seen."""
     row = session.get(WatchRow, job.id)
     if row is not None:
-        _set(row, ended(settled(row.watch, put_back=True, why_not=None), WatchEnd.ROLLED_BACK))
+        _set(row, ended(settled(row.watch, rolled_back=True, reason=None), WatchEnd.ROLLED_BACK))
 
 
-def settled(watch: AcceptanceWatch, put_back: bool, why_not: str | None) -> AcceptanceWatch:
+def settled(watch: AcceptanceWatch, rolled_back: bool, reason: str | None) -> AcceptanceWatch:
     """The watch, which has found trouble, with what was done about it."""
     assert watch.trouble is not None
-    trouble = watch.trouble.model_copy(update={"put_back": put_back, "why_not": why_not})
+    trouble = watch.trouble.model_copy(update={"rolled_back": rolled_back, "reason": reason})
     return watch.model_copy(update={"trouble": trouble})
 
 

@@ -40,8 +40,8 @@ class States(Fleet):
     def __init__(self, stack: ExitStack, folder: Path) -> None:
         super().__init__(stack, folder, MEMBERS, ts=0.1)
         self.pace(10.0)
-        self.proposed = self.retune(requested_by="M. Weber")
-        answer = self.http.post("/retunes", json={"pattern": "FIC-2*", "requested_by": "M. Weber"})
+        self.proposed = self.retune(by="M. Weber")
+        answer = self.http.post("/batches", json={"pattern": "FIC-2*", "by": "M. Weber"})
         assert answer.status_code == 202, answer.text
         self.many = answer.headers["location"]
         assert self.finished(self.proposed)["state"] == "proposed"
@@ -49,7 +49,7 @@ class States(Fleet):
         self.refused = refused["url"]
         assert self.finished(self.refused)["state"] == "refused"
         self.pace(1.0)  # a test in five stages takes minutes
-        self.under_test = self.retune(UNDER_TEST, method="five-stage", requested_by="A. Lind")
+        self.under_test = self.retune(UNDER_TEST, method="five-stage", by="A. Lind")
         self.until(self.under_test, lambda job: job["stage"] not in (None, "preflight"))
 
 
@@ -107,7 +107,7 @@ def jobs(pages: Pages, site: States) -> Page:
 
 
 def many(pages: Pages, site: States) -> Page:
-    page = pages.open("/ui/retunes", bypass_csp=True)
+    page = pages.open("/ui/batches", bypass_csp=True)
     page.get_by_role("textbox", name="Loops").fill("*IC-*")
     expect(page.get_by_role("button", name=re.compile(r"Retune \d loops"))).to_be_visible()
     return page

@@ -29,7 +29,7 @@ def test_a_plant_that_is_switched_off_in_a_test(site: Site, pages: Pages) -> Non
     expect(loops.get_by_role("row", name=TAG).locator(".pvnum")).to_have_text(re.compile(r"^50\."))
     expect(abnormal.get_by_text("No active alarms.")).to_be_visible()
     expect(abnormal).to_have_title("Loopwright")
-    job = site.http.post(f"/loops/{TAG}/retune", json={"requested_by": "A. Lind"}).json()["url"]
+    job = site.http.post(f"/loops/{TAG}/retune", json={"by": "A. Lind"}).json()["url"]
     until(lambda: site.http.get(job).json()["stage"] == "relay")
     site.plant.stop()
 
@@ -51,11 +51,11 @@ def test_a_plant_that_is_switched_off_in_a_test(site: Site, pages: Pages) -> Non
     expect(abnormal).to_have_title("(1) Loopwright")
     expect(failed).to_have_count(0)
     (entry,) = site.http.get("/audit?what=acknowledge_alarm").json()
-    assert (entry["said_by"], entry["loop"]) == ("B. Berg", TAG)
+    assert (entry["by"], entry["loop"]) == ("B. Berg", TAG)
 
     with pages.expecting("ERR_CONNECTION_REFUSED"):
         assert site.service.stop() == 0
-        silent = abnormal.get_by_role("row", name=re.compile("No word from the service"))
+        silent = abnormal.get_by_role("row", name=re.compile("Service offline"))
         expect(silent).to_be_visible()
         expect(abnormal.get_by_role("row", name=re.compile(r"Node 10h \(16\) is lost"))).to_have_class("old")
         expect(abnormal).to_have_title("(2) Loopwright")

@@ -37,9 +37,9 @@ def test_a_loop_of_another_gateway(site: GatewaySite, pages: Pages) -> None:
     page.get_by_role("button", name=f"Write to {LOOP}").click()
     expect(page.locator(".decide")).to_contain_text("Accepted by A. Lind")
     assert abs(site.kp() - CASE.kp) > 1.0
-    page.get_by_role("button", name="Roll back to the old gains…").click()
+    page.get_by_role("button", name="Roll back to the previous gains…").click()
     page.get_by_role("button", name=f"Roll {LOOP} back").click()
-    expect(page.locator(".decide")).to_contain_text("The loop runs on its old gains")
+    expect(page.locator(".decide")).to_contain_text("The loop runs on its previous gains")
     assert site.kp() == pytest.approx(CASE.kp)
     site.other.kill()
     expect(page.locator(".refusal")).to_contain_text(f"no data from gateway {OTHER} for ")

@@ -30,6 +30,6 @@ def test_its_stages_and_its_result(site: Site, pages: Pages, method: str) -> Non
     else:
         assert names[-1] == "Set-point step, new gains" and "Ultimate gain" in names
     before, after = person.figure(page, "Gain Kp")
-    assert before == pytest.approx(job["old_gains"]["Kp"], rel=1e-3)
+    assert before == pytest.approx(job["previous_gains"]["Kp"], rel=1e-3)
     assert after == pytest.approx(job["new_gains"]["Kp"], rel=1e-3)
     expect(page.get_by_role("img", name="PV measured, set-point and model")).to_be_visible()

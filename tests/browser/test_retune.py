@@ -49,14 +49,14 @@ def test_retuned_compared_accepted_and_rolled_back(site: Site, page: Page) -> No
     assert seen == sorted(seen, key=STAGES.index) and {"Relay test", "Set-point step, new gains"} <= set(seen)
 
     job = site.latest()
-    assert (job["state"], job["requested_by"]) == ("proposed", NAME)
+    assert (job["state"], job["by"]) == ("proposed", NAME)
     Kp, Ti = (person.figure(page, name) for name in ("Gain Kp", "Integral time Ti"))
     assert Kp == pytest.approx((old.kp, job["new_gains"]["Kp"]), rel=5e-4)
     assert Ti == pytest.approx((old.ti, job["new_gains"]["Ti"]), rel=5e-4)
     assert person.figure(page, "Largest sensitivity Ms")[1] == pytest.approx(1.6, abs=0.01)
 
     designs = site.ask(f"{job['url']}/designs")
-    assert_drawn(page, designs["after_curves"]["setpoint"]["pv"])
+    assert_drawn(page, designs["new_curves"]["setpoint"]["pv"])
 
     # a slower loop by the slider: other gains in the table, and no way to accept what was not on the loop
     slider = page.get_by_role("slider", name="Ms", exact=True)
@@ -83,7 +83,7 @@ def test_retuned_compared_accepted_and_rolled_back(site: Site, page: Page) -> No
     page.keyboard.press("Enter")
     page.get_by_role("button", name=f"Write to {TAG}").click()
     expect(person.headline(page)).to_have_text("Accepted")
-    expect(page.locator(".choice")).to_contain_text(designs["after_beside"])
+    expect(page.locator(".choice")).to_contain_text(designs["new_beside"])
     expect(page.locator(".choice")).not_to_contain_text("present gains")
     expect(person.decision(page)).to_contain_text(f"Accepted by {NAME}; in effect now: Kp {Kp[1]:.2f}")
     gains = site.ask(f"/loops/{TAG}")["live"]["gains"]
@@ -91,10 +91,10 @@ def test_retuned_compared_accepted_and_rolled_back(site: Site, page: Page) -> No
     assert site.state().gains.Kp == pytest.approx(job["new_gains"]["Kp"])
     expect(page.get_by_role("region", name="Gains and limits")).to_contain_text(f"{Kp[1]:.2f}")
 
-    page.get_by_role("button", name="Roll back to the old gains").click()
-    expect(person.decision(page)).to_contain_text("Write the old gains, Kp 80.00 %/°C, Ti 1.200 s, back")
+    page.get_by_role("button", name="Roll back to the previous gains").click()
+    expect(person.decision(page)).to_contain_text("Write the previous gains, Kp 80.00 %/°C, Ti 1.200 s, back")
     page.get_by_role("button", name=f"Roll {TAG} back").click()
-    expect(person.headline(page)).to_have_text("Rolled back to the old gains")
+    expect(person.headline(page)).to_have_text("Rolled back to the previous gains")
     assert site.is_home() and site.job(job["url"])["state"] == "rolled_back"
 
 
@@ -115,8 +115,8 @@ def test_another_Ms_is_tried_on_the_loop_before_it_can_be_accepted(site: Site, p
     expect(person.headline(page)).to_have_text("New gains are proposed")
     expect(page.get_by_role("region", name="Result")).to_contain_text("Ms 1.40 on the model")
     second = site.latest()
-    assert second["url"] != first["url"] and (second["state"], second["requested_by"]) == ("proposed", NAME)
-    assert second["predicted"]["Ms"] == pytest.approx(1.4, abs=0.01) and second["after"]["settled"]
+    assert second["url"] != first["url"] and (second["state"], second["by"]) == ("proposed", NAME)
+    assert second["predicted"]["Ms"] == pytest.approx(1.4, abs=0.01) and second["step_after"]["settled"]
     assert second["new_gains"]["Kp"] < first["new_gains"]["Kp"] and site.is_home()
     expect(page.get_by_role("button", name="Accept the new gains")).to_be_enabled()
     # the first proposal is no longer to be decided

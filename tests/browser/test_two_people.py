@@ -18,7 +18,7 @@ OTHER = "B. Roth"
 
 
 def proposed(site: Site) -> None:
-    assert site.finished(site.retune(requested_by=person.NAME))["state"] == "proposed"
+    assert site.finished(site.retune(by=person.NAME))["state"] == "proposed"
 
 
 def test_the_test_of_one_is_seen_by_the_other(site: Site, pages: Pages, page: Page) -> None:
@@ -78,7 +78,7 @@ def test_who_asks_too_late_is_shown_the_test_of_the_other(site: Site, pages: Pag
     def overtaken(route: Route) -> None:
         """The other one's request arrives first."""
         site.write("plant_pace", 1.0)
-        started.append(site.retune(requested_by=person.NAME))
+        started.append(site.retune(by=person.NAME))
         route.continue_()
 
     page.route("**/retune", overtaken)
@@ -103,10 +103,10 @@ def test_what_one_accepts_the_other_sees(site: Site, pages: Pages, page: Page) -
     page.get_by_role("button", name=f"Write to {TAG}").click()
     expect(person.headline(other)).to_have_text("Accepted")
     expect(person.decision(other)).to_contain_text(f"Accepted by {person.NAME}")
-    other.get_by_role("button", name="Roll back to the old gains…").click()
+    other.get_by_role("button", name="Roll back to the previous gains…").click()
     person.sign(other, OTHER)
     other.get_by_role("button", name=f"Roll {TAG} back").click()
-    expect(person.headline(page)).to_have_text("Rolled back to the old gains")
+    expect(person.headline(page)).to_have_text("Rolled back to the previous gains")
     assert site.is_home()
 
 

@@ -45,7 +45,7 @@ The loop is model 14 of the 50, sampled at {ts:g} s, run at {pace:g} times real 
 not hang on the stage, or is there for a loop in manual, and pulses of its manual output: `manual-up` is the first pulse
 while MV is away, `manual-back` the same one as soon as MV is back, `manual-rest` the second one when PV is left to
 itself. A run in which the machine itself stood still for 0.4 s is repeated, twice at most, unless its end is bad: the
-heartbeat time is 1.5 s, and `device_went_back` with no fault in sight is such a machine's.
+heartbeat time is 1.5 s, and `session_ended_by_device` with no fault in sight is such a machine's.
 """
 
 EARLIER = """
@@ -54,8 +54,8 @@ EARLIER = """
 
 WATCH = """## The watch after acceptance
 
-Gains are accepted, with "put the old gains back by itself" ([watch.md](watch.md)). A load that MV cannot balance then
-takes PV out of its limits, and the watch is to put the old gains back. A fault strikes
+Gains are accepted, with "put the previous gains back automatically" ([watch.md](watch.md)). A load that MV cannot
+balance then takes PV out of its limits, and the previous gains are to be put back. A fault strikes
 
 {moments}
 

@@ -8,10 +8,10 @@ from loopwright.tuning.rules.registry import ANY, Method, Option
 from loopwright.tuning.rules.setting import Setting
 
 
-def _by_model(model: Model, ms: float = 1.6, derivative: bool = False, aim: str = Aim.BALANCED) -> Setting:
+def _by_model(model: Model, Ms: float = 1.6, derivative: bool = False, aim: str = Aim.BALANCED) -> Setting:
     from loopwright.tuning.fast.design_trial import designed_on  # and with it the whole procedure
 
-    best = designed_on(model, DesignSpec(Ms=ms, derivative=derivative, aim=aim_of(aim)), 0.0)
+    best = designed_on(model, DesignSpec(Ms=Ms, derivative=derivative, aim=aim_of(aim)), 0.0)
     return Setting(best.gains, {"Ms": best.Ms})
 
 
@@ -24,7 +24,7 @@ BY_MODEL = Method(
     ANY,
     _by_model,
     {
-        "ms": Option("", 1.6, "maximum sensitivity that is designed for: 1.2 robust to 2.0 fast", range=(1.2, 2.0)),
+        "Ms": Option("", 1.6, "maximum sensitivity that is designed for: 1.2 robust to 2.0 fast", range=(1.2, 2.0)),
         "derivative": Option("", False, "design a PID where a derivative improves the loop", kind="flag"),
         "aim": Option("", str(Aim.BALANCED), "what the gains are the best for", tuple(map(str, Aim)), kind="choice"),
     },

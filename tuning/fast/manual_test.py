@@ -69,7 +69,7 @@ class ManualTest(Experiment):
         self.largest = largest_pulse(self.home, facts.mv_low, facts.mv_high, facts.mv_step_max, only)
         if not self.largest > 0.0:
             raise Refused(Reason.SATURATED, f"MV {self.home:.4g} leaves no room for a pulse")
-        self.size = first_pulse(facts.old_gains.Kp * facts.sp_deviation, self.largest)
+        self.size = first_pulse(facts.previous_gains.Kp * facts.sp_deviation, self.largest)
         self.turns: list[int] = []  # samples at which MV left home, or came back
         self.period = 0.0
         """The time scale of the record, in samples; known after the first pulse."""

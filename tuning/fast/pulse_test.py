@@ -68,10 +68,10 @@ class PulseTest(Experiment):
 
     def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace) -> None:
         super().__init__(facts, point, listened)
-        self.size = pulse_size(facts.sp_deviation, point.room, facts.old_gains, facts.one_sided)
+        self.size = pulse_size(facts.sp_deviation, point.room, facts.previous_gains, facts.one_sided)
         self.turns: list[int] = []  # samples at which the set-point moved; the first one is the start
         self.levels: list[float] = []  # of the set-point, in sizes of a pulse
-        self._gains = facts.old_gains
+        self._gains = facts.previous_gains
         self._at_limit = 0
         self.period = 0.0
         """The time scale of the record, in samples, from `first_period`."""
@@ -241,7 +241,7 @@ class PulseTest(Experiment):
             low=facts.mv_low - mv,
             high=facts.mv_high - mv,
             action=self._direction,
-            gains=facts.old_gains,
+            gains=facts.previous_gains,
             sp_step_max=facts.sp_rate_max_per_s * facts.sample_time_s,
         )
 

@@ -115,7 +115,7 @@ def tune(
     model: a model of this library, what `identify` has found, a transfer function of another library (control,
     scipy.signal), or a model by names, as `as_model` takes it.
     method, options: a name of `METHODS`, and options of that method; or "fast", whose design for a maximum sensitivity
-    (ms=1.6) is the one that the procedure `tuning.fast` makes of the model that it has found.
+    (Ms=1.6) is the one that the procedure `tuning.fast` makes of the model that it has found.
     dead_time_s: the dead time of a transfer function of another library, s.
     Raises Refused: BAD_INPUT (method, option), or as the rule does: NOT_SELF_REGULATING, OUTSIDE_RANGE,
     CANNOT_OSCILLATE. Raises TypeError for what is no model, ValueError for coefficients that make none.

@@ -18,8 +18,8 @@ from enum import StrEnum
 from loopwright.service.api.gate.limits import RequestLimits
 
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
-_ABORT = re.compile(r"/(?:jobs|retunes)/[^/]+/abort")
-_PREVIEW = re.compile(r"/loops/[^/]+/retune/preview|/retunes/preview")
+_ABORT = re.compile(r"/(?:jobs|batches)/[^/]+/abort")
+_PREVIEW = re.compile(r"/loops/[^/]+/retune/preview|/batches/preview")
 
 
 class RequestKind(StrEnum):
@@ -53,7 +53,7 @@ def changes_nothing(path: str) -> bool:
 
 
 def stops_a_test(method: str, path: str) -> bool:
-    """Whether the request is the abort of a job or of a retune of many loops."""
+    """Whether the request is the abort of a job or of a batch."""
     return method == "POST" and _ABORT.fullmatch(path) is not None
 
 

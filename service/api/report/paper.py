@@ -76,7 +76,7 @@ def paper(source: ReportSource) -> str:
     """Returns the report as HTML."""
     job, loop = source.job, source.loop
     pv_unit = "PV units" if loop is None else n.unit(loop.pv_unit)
-    old, new = job.old_gains, job.new_gains
+    old, new = job.previous_gains, job.new_gains
     before, after = _performance(source, False), _performance(source, True)
     size = _step_size(source)
     Ms = after.Ms if after is not None else before.Ms if before is not None else None
@@ -151,8 +151,8 @@ def _verdict(job: JobView) -> str | None:
     acceptance."""
     if (compared := job.comparison) is None:
         return None
-    if job.state in (JobState.ACCEPTED, JobState.ROLLED_BACK) and compared.after.stable:
-        return beside(compared.before, compared.after)
+    if job.state in (JobState.ACCEPTED, JobState.ROLLED_BACK) and compared.new.stable:
+        return beside(compared.previous, compared.new)
     return compared.verdict
 
 
@@ -163,11 +163,11 @@ def _gains(view: GainsView | None) -> Gains | None:
 def _curves(source: ReportSource) -> tuple[LoopCurves | None, LoopCurves | None]:
     """What the gains before and after do: as computed with the designs, else on the job's model."""
     if (designs := source.designs) is not None:
-        return designs.before_curves, designs.after_curves
+        return designs.previous_curves, designs.new_curves
     job, Ts = source.job, source.job.sample_time_s or 0.0
     if job.model is None:
         return None, None
-    model, old, new = delayed(job.model.process_model(), 0.5 * Ts), _gains(job.old_gains), _gains(job.new_gains)
+    model, old, new = delayed(job.model.process_model(), 0.5 * Ts), _gains(job.previous_gains), _gains(job.new_gains)
     ends = horizons(model, (new, old), Ts)
     found = [None if gains is None else loop_curves(model, gains, ends, Ts) for gains in (old, new)]
     return found[0], found[1]
@@ -175,15 +175,15 @@ def _curves(source: ReportSource) -> tuple[LoopCurves | None, LoopCurves | None]
 
 def _performance(source: ReportSource, after: bool) -> PerformanceView | None:
     if (compared := source.job.comparison) is not None:
-        return compared.after if after else compared.before
+        return compared.new if after else compared.previous
     if source.designs is None:
         return None
-    return source.designs.after if after else source.designs.before
+    return source.designs.new if after else source.designs.previous
 
 
 def _step_size(source: ReportSource) -> float:
     job = source.job
-    for measured in (job.verification, job.after, job.before):
+    for measured in (job.verification, job.step_after, job.step_before):
         if measured is not None and measured.step:
             return abs(measured.step)
     return 1.0 if source.loop is None else source.loop.sp_deviation
@@ -202,8 +202,8 @@ def _head(source: ReportSource) -> list[Row]:
         rows += [("area", loop.area, False)] if loop.area else []
         rows += [("controller", where, False)]
     rows += [
-        ("job", job.id, False), ("gateway", job.host, False),
-        ("asked by", job.requested_by, False), ("method", job.method, False),
+        ("job", job.id, False), ("gateway", job.gateway, False),
+        ("asked by", job.by, False), ("method", job.method, False),
         ("asked for", f"{n.date(job.created_at)} UTC", False), ("begun", f"{n.date(job.started_at)} UTC", False),
         ("ended", f"{n.date(job.ended_at)} UTC", False), ("plant time", n.duration(job.plant_time_s), False),
     ]  # fmt: skip
@@ -215,14 +215,14 @@ def _decided(job: JobView, events: Sequence[JobEvent]) -> str:
         if job.decided.what == "accept":
             what = "The new gains were accepted"
         elif any(event.kind == "state" and event.data.get("state") == JobState.ACCEPTED for event in events):
-            what = "The new gains were accepted first, and the old ones put back"
+            what = "The new gains were accepted first, and the previous ones put back"
         else:
-            what = "The old gains were kept"
+            what = "The previous gains were kept"
         return f"{what} by {job.decided.by}, {n.date(job.decided.at)} UTC."
     if job.superseded_by is not None:
         return f"Nothing was decided before the later test, {job.superseded_by}."
     if job.state is JobState.PROPOSED:
-        return "Nothing is decided: the loop runs on its old gains."
+        return "Nothing is decided: the loop runs on its previous gains."
     return ""
 
 
@@ -232,7 +232,7 @@ def _afterwards(job: JobView, decimals: int, pv_unit: str) -> str:
         return ""
     restored = job.restored
     if restored is None:
-        return "The loop could not be read back at the end: look at the controller." if job.old_gains else ""
+        return "The loop could not be read back at the end: look at the controller." if job.previous_gains else ""
     text = f"At the end the loop was read back: {restored.get('mode')}"
     if isinstance(sp := restored.get("sp"), int | float):
         text += f", set-point {n.with_unit(n.fixed(sp, decimals), pv_unit)}"
@@ -303,8 +303,8 @@ def _table(
     row("IAE of a unit set-point step", "s", *figure_step("IAE", "setpoint"))
     row(f"IAE of a load step of {LOAD_PCT:g} %", f"{pv_unit} s", *figure_step("IAE", "load"))
     row("Largest deviation after it", pv_unit, *figure_step("peak", "load"))
-    if job.before is not None or job.after is not None:
-        measured = (job.before, job.after)
+    if job.step_before is not None or job.step_after is not None:
+        measured = (job.step_before, job.step_after)
 
         def both(name: str) -> tuple[float | None, float | None]:
             found = [None if each is None else getattr(each, name) for each in measured]
@@ -436,12 +436,12 @@ def _designs(curve: DesignCurve | None) -> list[list[str]]:
 def _asked(source: ReportSource) -> list[Row]:
     job, loop = source.job, source.loop
     rows: list[Row] = []
-    asked = {name: value for name, value in job.request.items() if name not in ("method", "requested_by", "by")}
+    asked = {name: value for name, value in job.request.items() if name not in ("method", "by")}
     given = ", ".join(f"{name} {_value(value)}" for name, value in asked.items() if value not in (None, False, {}, []))
     rows.append(("options", given or "none", True))
-    if job.chosen:
-        chosen = ", ".join(f"{name} {n.significant(value)}" for name, value in job.chosen.items())
-        rows.append(("design", chosen, True))
+    if job.design:
+        design = ", ".join(f"{name} {n.significant(value)}" for name, value in job.design.items())
+        rows.append(("design", design, True))
     if loop is not None:
         pv, mv = loop.pv_limits, loop.mv_limits
         low = _number(job.request.get("mv_low"), mv.low)

@@ -114,13 +114,13 @@ def trust(job: JobView) -> list[str]:
         Ms = job.predicted.Ms if job.predicted else job.evidence.Ms
         within = job.evidence.uncertainty
         said.append(f"Ms is {fixed(Ms, 2)}" + (f", known to within {Ms_error(within)}." if within is not None else "."))
-    if job.tried is False:
-        said.append("The new gains were never tried on this loop.")
+    if job.tested_on_loop is False:
+        said.append("The new gains were never tested on this loop.")
     if job.rehearsed_on is not None:
         said.append(f"Computed on {job.rehearsed_on.plant_text}; the loop was not moved.")
-    if job.after is not None and job.verification is None:
-        settled = f"settled in {duration(job.after.settling_s)}" if job.after.settled else "not settled"
-        overshoot = fixed(job.after.overshoot_pct, 0)
+    if job.step_after is not None and job.verification is None:
+        settled = f"settled in {duration(job.step_after.settling_s)}" if job.step_after.settled else "not settled"
+        overshoot = fixed(job.step_after.overshoot_pct, 0)
         said.append(f"A step under the new gains was measured: overshoot {overshoot} %, {settled}.")
     return said
 

@@ -20,7 +20,7 @@ def upgrade() -> None:
         sa.Column("state", sa.String, nullable=False),
         sa.Column("dry_run", sa.Boolean, nullable=False),
         sa.Column("request", sa.JSON, nullable=False),
-        sa.Column("requested_by", sa.String, nullable=False),
+        sa.Column("by", sa.String, nullable=False),
         sa.Column("created_at", sa.String, nullable=False),
         sa.Column("started_at", sa.String),
         sa.Column("ended_at", sa.String),
@@ -29,7 +29,7 @@ def upgrade() -> None:
         sa.Column("stage_times_s", sa.JSON),
         sa.Column("reason", sa.String),
         sa.Column("detail", sa.String),
-        sa.Column("old_gains", sa.JSON),
+        sa.Column("previous_gains", sa.JSON),
         sa.Column("restored", sa.JSON),
         sa.Column("result", sa.JSON),
         sa.Column("host", sa.String, nullable=False, server_default="local"),
@@ -37,7 +37,7 @@ def upgrade() -> None:
         sa.Column("attempt", sa.Integer, nullable=False, server_default="0"),
         sa.Column("found", sa.JSON),
         sa.Column("session", sa.BigInteger),
-        sa.Column("look_after", sa.Boolean, nullable=False, server_default=sa.false()),
+        sa.Column("restore_unconfirmed", sa.Boolean, nullable=False, server_default=sa.false()),
         sa.Column("false_pv", sa.Boolean, nullable=False, server_default=sa.false()),
         sa.Column("stop_reason", sa.String),
     )
@@ -45,7 +45,7 @@ def upgrade() -> None:
     op.create_index("jobs_by_loop", "jobs", ["loop", "number"])
     op.create_index("jobs_by_reason", "jobs", ["reason"])
     op.create_index("jobs_false_pv", "jobs", ["false_pv"])
-    op.create_index("jobs_looked_after", "jobs", ["look_after"])
+    op.create_index("jobs_restore_unconfirmed", "jobs", ["restore_unconfirmed"])
     op.create_index(
         "one_active_job_per_loop",
         "jobs",
@@ -102,7 +102,7 @@ def upgrade() -> None:
         sa.Column("claim_token", sa.String),
         sa.Column("state", sa.String, nullable=False),
         sa.Column("answer", sa.JSON),
-        sa.Column("roll_back_by_itself", sa.Boolean),
+        sa.Column("auto_rollback", sa.Boolean),
     )
     op.create_index("decision_requests_by_host", "decision_requests", ["host", "state"])
     op.create_index("decision_requests_by_job", "decision_requests", ["job_id", "number"])
@@ -141,7 +141,7 @@ def upgrade() -> None:
         sa.Column("loop", sa.String, nullable=False),
         sa.Column("at", sa.String, nullable=False),
         sa.Column("finding", sa.JSON, nullable=False),
-        sa.Column("older_plant", sa.String),
+        sa.Column("superseded", sa.String),
     )
     op.create_index("loop_knowledge_by_loop", "loop_knowledge", ["loop", "number"])
     op.create_table(
@@ -199,22 +199,22 @@ def upgrade() -> None:
     )
     op.create_index("webhook_deliveries_due", "webhook_deliveries", ["host", "state", "due_s"])
     op.create_table(
-        "retunes",
+        "batches",
         sa.Column("number", sa.Integer, primary_key=True, autoincrement=True),
         sa.Column("id", sa.String, nullable=False, unique=True),
         sa.Column("host", sa.String, nullable=False),
         sa.Column("state", sa.String, nullable=False),
         sa.Column("request", sa.JSON, nullable=False),
-        sa.Column("requested_by", sa.String, nullable=False),
+        sa.Column("by", sa.String, nullable=False),
         sa.Column("created_at", sa.String, nullable=False),
         sa.Column("ended_at", sa.String),
         sa.Column("stop_reason", sa.String),
         sa.Column("detail", sa.String),
     )
-    op.create_index("retunes_by_host", "retunes", ["host", "ended_at"])
+    op.create_index("batches_by_host", "batches", ["host", "ended_at"])
     op.create_table(
-        "retune_loops",
-        sa.Column("retune_id", sa.String, sa.ForeignKey("retunes.id"), primary_key=True),
+        "batch_loops",
+        sa.Column("batch_id", sa.String, sa.ForeignKey("batches.id"), primary_key=True),
         sa.Column("position", sa.Integer, primary_key=True),
         sa.Column("loop", sa.String, nullable=False),
         sa.Column("job_id", sa.String, sa.ForeignKey("jobs.id")),
@@ -250,11 +250,11 @@ def upgrade() -> None:
         "audit",
         sa.Column("number", sa.Integer, primary_key=True, autoincrement=True),
         sa.Column("at", sa.String, nullable=False),
-        sa.Column("who", sa.String, nullable=False),
+        sa.Column("key", sa.String, nullable=False),
         sa.Column("key_id", sa.String),
         sa.Column("address", sa.String),
         sa.Column("gateway", sa.String),
-        sa.Column("said_by", sa.String),
+        sa.Column("by", sa.String),
         sa.Column("what", sa.String, nullable=False),
         sa.Column("subject", sa.String, nullable=False),
         sa.Column("loop", sa.String),
@@ -268,8 +268,8 @@ def downgrade() -> None:
     op.drop_table("audit")
     op.drop_table("api_keys")
     op.drop_table("idempotency_keys")
-    op.drop_table("retune_loops")
-    op.drop_table("retunes")
+    op.drop_table("batch_loops")
+    op.drop_table("batches")
     op.drop_table("webhook_deliveries")
     op.drop_table("alarm_acknowledgements")
     op.drop_table("watches")

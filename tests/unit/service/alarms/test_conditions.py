@@ -94,7 +94,7 @@ def test_a_false_pv_is_an_alarm_at_once_which_says_what_the_loop_was_left_in(
     found = FalsePvJob("4f0c2a9be113", "A", "gw-2", AT, reason, None if state is None else state_json(state))
     known = facts(false_pvs=(found,), tests=(job(JobState.FAILED, reason),))
     ((alarm,), (later,)) = steps(known, 0.0, 1e6)
-    assert (alarm.priority, alarm.kind, alarm.loops, alarm.host) == (1, AlarmKind.FALSE_PV, ["A"], "gw-2")
+    assert (alarm.priority, alarm.kind, alarm.loops, alarm.gateway) == (1, AlarmKind.FALSE_PV, ["A"], "gw-2")
     assert alarm.text == f"PV was found to be false in a test; the loop {words}"
     assert alarm.advice.startswith(first) and "when PV is right again" in alarm.advice
     assert "No test begins until somebody acknowledges this" in alarm.advice and alarm.unacknowledged
@@ -110,7 +110,7 @@ def test_a_loop_that_was_not_confirmed_to_be_as_before_is_an_alarm_at_once_and_u
     assert (alarm.priority, alarm.kind, alarm.subject, alarm.loops) == (1, AlarmKind.NOT_RESTORED, "A", ["A"])
     assert alarm.text == "Not confirmed that the loop is as before the test"
     assert "Look at the controller now" in alarm.advice and "until somebody acknowledges it" in alarm.advice
-    assert (alarm.since, alarm.host, alarm.job, alarm.unacknowledged) == (AT, "gw-2", "/jobs/4f0c2a9be113", True)
+    assert (alarm.since, alarm.gateway, alarm.job, alarm.unacknowledged) == (AT, "gw-2", "/jobs/4f0c2a9be113", True)
     assert later == alarm, "it is the only alarm of that test"
     ids = {alarm_id(kind, "4f0c2a9be113") for kind in (NOT_RESTORED, FALSE_PV, "test_failed")}
     assert to_be_asked(facts(tests=known.tests)) == ids
@@ -119,7 +119,7 @@ def test_a_loop_that_was_not_confirmed_to_be_as_before_is_an_alarm_at_once_and_u
 
 
 def test_a_loop_that_was_read_back_later_says_so() -> None:
-    ((alarm,),) = steps(facts(unconfirmed=(unconfirmed(looked_after=False),)), 0.0)
+    ((alarm,),) = steps(facts(unconfirmed=(unconfirmed(monitored=False),)), 0.0)
     assert alarm.advice.startswith("The loop was read back later") and "until somebody acknowledges it" in alarm.advice
     ((alarm,),) = steps(facts(unconfirmed=(unconfirmed(reason=Reason.NODE_LOST),)), 0.0)
     assert alarm.priority == 1 and "signs" not in alarm.advice
@@ -147,7 +147,7 @@ def test_an_error_that_names_the_bus_names_it_once() -> None:
 def test_a_bus_that_only_the_listening_process_has_lost_says_so() -> None:
     known = facts(buses=(BusFacts(BUS, "the listening process has died", T0),))
     (found,) = conditions(known)
-    assert found.text == f"Bus {BUS} is not heard: the listening process has died" and "Tests go on" in found.advice
+    assert found.text == f"No data of bus {BUS}: the listening process has died" and "Tests go on" in found.advice
 
 
 def test_a_node_that_is_lost_is_one_alarm_which_names_its_loops() -> None:
@@ -193,7 +193,7 @@ def test_a_loop_without_data_counts_from_its_last_sample() -> None:
 def test_a_loop_of_which_no_sample_ever_came(t95_s: float, after_s: float) -> None:
     known = facts(LoopFacts(config(t95_s=t95_s)), buses=(BusFacts(BUS, None, T0),))
     none, (alarm,) = steps(known, after_s - 0.1, after_s)
-    assert not none and alarm.text == "No data since the bus is heard"
+    assert not none and alarm.text == "No data since the bus is up"
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from loopwright.service.jobs.aftercare import Aftercare
 from loopwright.service.listening.heard_loop import Heard, InEffect
 from loopwright.service.listening.listening import Listening
 from loopwright.service.states.job_state import JobState
-from loopwright.service.store import audit, looked_after
+from loopwright.service.store import audit, unconfirmed_restorations
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import LoopRow
@@ -118,7 +118,7 @@ def not_restored(controller: FakeController) -> None:
 
 def left(service: Service) -> Job:
     job = ended(service, becomes=not_restored)
-    assert (job.state, job.reason, job.look_after) == (JobState.FAILED, Reason.RESTORE_UNCONFIRMED, True)
+    assert (job.state, job.reason, job.restore_unconfirmed) == (JobState.FAILED, Reason.RESTORE_UNCONFIRMED, True)
     return job
 
 
@@ -247,7 +247,7 @@ def test_a_loop_that_was_not_confirmed_stays_an_alarm_over_restarts_until_it_is_
         assert (alarm.priority, alarm.kind, alarm.loop) == (1, AlarmKind.NOT_RESTORED, TAG)
         assert alarm.job == f"/jobs/{job.id}" and "Look at the controller now" in alarm.advice
     with closing(Service(tmp_path)) as second:
-        assert looked_after.home_again(second.store, job.id, {}, "read back")
+        assert unconfirmed_restorations.confirmed(second.store, job.id, {}, "read back")
         ended(second)
         watched = Watched(second)
         (again,) = watched.watch.look()
@@ -261,7 +261,7 @@ def test_a_loop_that_was_not_confirmed_stays_an_alarm_over_restarts_until_it_is_
         assert list(watched.watch.look()) == []
         assert watched.watch.find(alarm.id) == signed
         (entry,) = audit.trail(third.store.engine, 10, what=["acknowledge_alarm"])
-        assert (entry.subject, entry.loop, entry.said_by) == (alarm.id, TAG, "A. Lind")
+        assert (entry.subject, entry.loop, entry.by) == (alarm.id, TAG, "A. Lind")
         assert entry.before is not None and entry.before["text"] == alarm.text
 
 
@@ -282,9 +282,9 @@ def test_a_loop_that_is_looked_after_for_another_reason_is_an_alarm_until_it_is_
 
     service = watched.service
     job = ended(service, becomes=gone)
-    assert (job.reason, job.look_after) == (Reason.NODE_LOST, True)
+    assert (job.reason, job.restore_unconfirmed) == (Reason.NODE_LOST, True)
     assert [priority for priority, _ in watched.after(0.0)] == [1]
-    assert looked_after.home_again(service.store, job.id, {}, "read back")
+    assert unconfirmed_restorations.confirmed(service.store, job.id, {}, "read back")
     assert watched.after(1.0) == [(3, "The last test failed: node lost")]
 
 
@@ -317,10 +317,10 @@ class Gateway:
 def test_two_gateways_of_one_database_say_the_same_and_do_not_double(two: tuple[Store, Store]) -> None:
     job = two[0].create("A", {}, "me", False)
     two[0].move(job.id, JobState.RUNNING)
-    two[0].move(job.id, JobState.FAILED, reason=Reason.RESTORE_UNCONFIRMED.value, look_after=True)
+    two[0].move(job.id, JobState.FAILED, reason=Reason.RESTORE_UNCONFIRMED.value, restore_unconfirmed=True)
     watches = [AlarmWatch(Gateway(store), Listening({}, store, on=False)) for store in two]
     one, other = (list(watch.look()) for watch in watches)
-    assert one == other and [(alarm.priority, alarm.host) for alarm in one] == [(1, "gw-1")]
+    assert one == other and [(alarm.priority, alarm.gateway) for alarm in one] == [(1, "gw-1")]
     assert [watch.counts() for watch in watches] == [{1: 1, 2: 0, 3: 0}, {1: 0, 2: 0, 3: 0}]
     watches[1].acknowledge(one[0].id, "A. Lind")
     assert ids(watches[0].look()) == ids(watches[1].look()) == []
@@ -362,7 +362,7 @@ def test_over_rest(service: Service, client: TestClient) -> None:
     for path in ("/alarms/none", "/alarms/none/acknowledge"):
         method = "POST" if path.endswith("off") else "GET"
         assert "there is no alarm none" in assert_problem(client.request(method, path), 404)["detail"]
-    assert client.get("/audit?what=acknowledge_alarm").json()[0]["said_by"] == "A. Lind"
+    assert client.get("/audit?what=acknowledge_alarm").json()[0]["by"] == "A. Lind"
 
 
 def the_alarm(client: TestClient) -> dict[str, Any]:

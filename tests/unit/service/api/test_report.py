@@ -102,7 +102,7 @@ def recomputed(client: TestClient, job: str) -> str:
 
 
 def test_a_proposal(service: Service, client: TestClient) -> None:
-    job = finished(service, client, requested_by="A. Lind")
+    job = finished(service, client, by="A. Lind")
     answer, document = report(client, job["id"])
     assert_self_contained(answer, document)
     assert "New gains are proposed" in document.text and "A. Lind" in document.text
@@ -125,8 +125,8 @@ def test_the_hash_is_recomputed_and_outlives_the_decision(service: Service, clie
     assert "The new gains were accepted by C. Berg" in document.text
     client.post(f"/jobs/{job}/rollback", json={"by": "D. Roth"})
     text = report(client, job)[1].text
-    assert "The new gains were accepted first, and the old ones put back by D. Roth" in text
-    assert "The old gains were kept" not in text
+    assert "The new gains were accepted first, and the previous ones put back by D. Roth" in text
+    assert "The previous gains were kept" not in text
     fakes.add_samples(service.store, job, "relay", service.store.samples(job)[0][1][:1])
     assert recomputed(client, job) != expected and recomputed(client, job) in report(client, job)[1].text
 
@@ -134,11 +134,11 @@ def test_the_hash_is_recomputed_and_outlives_the_decision(service: Service, clie
 def test_markup_in_what_people_and_devices_say_stays_text(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fakes, "RESULT", RESULT.model_copy(update={"notes": [MARKUP], "chosen": {MARKUP: 1.0}}))
+    monkeypatch.setattr(fakes, "RESULT", RESULT.model_copy(update={"notes": [MARKUP], "design": {MARKUP: 1.0}}))
     told = {"description": MARKUP, "pv_unit": MARKUP, "area": MARKUP}
     config = service.loops["TIC-101"].model_copy(update=told)
     monkeypatch.setitem(service.loops, "TIC-101", config)
-    job = finished(service, client, requested_by=MARKUP)["id"]
+    job = finished(service, client, by=MARKUP)["id"]
     client.post(f"/jobs/{job}/accept", json={"by": MARKUP})
     answer, document = report(client, job)
     assert_self_contained(answer, document)
@@ -149,7 +149,7 @@ def test_markup_in_what_people_and_devices_say_stays_text(
     ("ends", "headline"),
     [
         (Refused(Reason.NOT_AT_REST, "PV moved by 3 <degC>"), "Refused: not at rest"),
-        (Failed(Reason.NODE_LOST, "node 32 does not answer"), "Failed: the node was lost"),
+        (Failed(Reason.NODE_LOST, "node 32 does not answer"), "Failed: node lost"),
         (RuntimeError("defect"), "Failed: an error inside the service"),
     ],
 )

@@ -54,7 +54,7 @@ def left(folder: Path, version: str = WORKFLOW_VERSION, done: tuple[str, ...] = 
     store = Store(folder)
     row = store.create(TAG, {}, "me", False, version=version)
     old = {"Kp": OLD.Kp, "Ti": OLD.Ti}
-    running: dict[str, Any] = {"old_gains": old, "found": state_json(HOME), "attempt": 1, "session": SESSION}
+    running: dict[str, Any] = {"previous_gains": old, "found": state_json(HOME), "attempt": 1, "session": SESSION}
     store.move(row.id, JobState.RUNNING, **running | columns)
     for stage in done:
         store.append(row.id, "stage_started", {"stage": stage, "expected_s": 1.0, "remaining_s": 1.0}, 5.0)
@@ -182,7 +182,7 @@ def test_what_somebody_changed_meanwhile_stays_and_the_job_does_not_go_on(
     job_id = left(tmp_path)
     service = again(started, tmp_path, becomes)
     row = service.store.get(job_id)
-    assert (row.state, row.reason, row.look_after) == ("interrupted", reason.value, False)
+    assert (row.state, row.reason, row.restore_unconfirmed) == ("interrupted", reason.value, False)
     assert words in (row.detail or "") and "not as before the job" in (row.detail or "")
     assert service.controller.state == found and row.restored == state_json(found)
 
@@ -212,7 +212,7 @@ def test_a_loop_that_is_not_reached_is_said_so(started: list[Service], tmp_path:
     job_id = left(tmp_path)
     service = again(started, tmp_path, away(Reason.NODE_LOST))
     row = service.store.get(job_id)
-    assert (row.state, row.reason, row.restored, row.look_after) == ("interrupted", "node_lost", None, True)
+    assert (row.state, row.reason, row.restored, row.restore_unconfirmed) == ("interrupted", "node_lost", None, True)
     assert "not reached" in (row.detail or "")
 
 
@@ -445,4 +445,4 @@ def test_no_loop_is_read_while_a_decision_is_carried_out(service: Service) -> No
     service.jobs.directory.open_loop = lambda config: Slow(service.controller)
     service.jobs.decisions.accept(first.id, "me")
     service.wait(seen[0])
-    assert service.store.get(seen[0]).old_gains == asdict(HOME.gains) | {"Kp": NEW.Kp, "Ti": NEW.Ti}
+    assert service.store.get(seen[0]).previous_gains == asdict(HOME.gains) | {"Kp": NEW.Kp, "Ti": NEW.Ti}

@@ -74,8 +74,8 @@ def test_a_word_that_is_not_known_names_its_job(store: Store) -> None:
 def test_one_active_job_per_loop_holds_in_the_database_itself(store: Store) -> None:
     store.create("A", {}, "me", False)
     copy = (
-        "INSERT INTO jobs (id, loop, state, dry_run, request, requested_by, created_at, plant_time_s)"
-        " SELECT 'x', loop, 'running', dry_run, request, requested_by, created_at, 0 FROM jobs"
+        "INSERT INTO jobs (id, loop, state, dry_run, request, by, created_at, plant_time_s)"
+        " SELECT 'x', loop, 'running', dry_run, request, by, created_at, 0 FROM jobs"
     )
     with store.engine.connect() as connection, pytest.raises(IntegrityError):
         connection.execute(text(copy))

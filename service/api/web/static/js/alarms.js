@@ -5,14 +5,14 @@ import { alarms, isSilent, now_s, silent_s } from "./state.js";
 
 /**
  * As GET /alarms has them.
- * @typedef {{id: string, priority: 1 | 2 | 3, kind?: string, host?: string, subject: string, text: string, advice: string, since: string, loop: string | null,
+ * @typedef {{id: string, priority: 1 | 2 | 3, kind?: string, gateway?: string, subject: string, text: string, advice: string, since: string, loop: string | null,
  *   loops: string[], job: string | null, unacknowledged: boolean}} Alarm
  */
 
 const silence = computed(() => {
   if (!isSilent.value) return null;
   return /** @type {Alarm} */ ({
-    id: "silent", priority: 2, subject: "this browser", text: "No word from the service",
+    id: "silent", priority: 2, subject: "this browser", text: "Service offline",
     advice: "What is shown is old. The page asks again by itself.",
     since: new Date(1000 * (now_s.peek() - silent_s.peek())).toISOString(), loop: null, loops: [], job: null, unacknowledged: false,
   });

@@ -96,15 +96,15 @@ const REASONS = {
 /** @param {string | null | undefined} reason */
 export const reasonWords = (reason) => (reason ? (REASONS[reason] ?? reason.replaceAll("_", " ")) : "");
 
-/** What became of a decision that was asked at another gateway than the loop's. @param {any} request @param {string} host the loop's gateway */
-export function decisionRequestWords(request, host) {
+/** What became of a decision that was asked at another gateway than the loop's. @param {any} request @param {string} gateway the loop's */
+export function decisionRequestWords(request, gateway) {
   const what = `${request.what === "accept" ? "Accepting" : "Rolling back"}, asked by ${request.by} at gateway ${request.gateway}`;
   switch (request.state) {
-    case "waiting": return `${what}: gateway ${host} has not begun it yet.`;
-    case "under_way": return `${what}: gateway ${host} is at it.`;
+    case "waiting": return `${what}: gateway ${gateway} has not begun it yet.`;
+    case "under_way": return `${what}: gateway ${gateway} is at it.`;
     case "refused": return `${what}, was not done: ${request.detail ?? "an error there"}.`;
     case "cut_off": return `${what}, was cut off: whether the gains were written is not known. Look at the gains in effect, then decide again.`;
-    default: return `${what}, was not done: gateway ${host} did not answer in time, and will not do it any more.`;
+    default: return `${what}, was not done: gateway ${gateway} did not answer in time, and will not do it any more.`;
   }
 }
 

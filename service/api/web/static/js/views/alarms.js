@@ -52,7 +52,7 @@ function Subject(alarm) {
   if (alarm.loop) return html`<a class="tag" href=${loopPath(alarm.loop)}>${alarm.loop}</a>`;
   const shown = alarm.loops.slice(0, MOST);
   const more = alarm.loops.length - shown.length;
-  const at = alarm.host && alarm.kind !== "gateway_silent" && isElsewhere({ host: alarm.host }) ? ` of gateway ${alarm.host}` : "";
+  const at = alarm.gateway && alarm.kind !== "gateway_offline" && isElsewhere({ gateway: alarm.gateway }) ? ` of gateway ${alarm.gateway}` : "";
   return html`<span key="of">${alarm.subject}${at}</span>${shown.length > 0 && html`<small key="loops">${shown.map((tag, n) => html`${n ? ", " : ""}<a class="tag" href=${loopPath(tag)}>${tag}</a>`)}${more > 0 ? ` and ${more} more` : ""}</small>`}`;
 }
 

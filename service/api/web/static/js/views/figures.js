@@ -27,7 +27,7 @@ export function Curve(width, points, ms, tested, msBefore, iaeBefore) {
     ${inside && html`<circle key="before" cx=${x(/** @type {number} */ (msBefore))} cy=${y(/** @type {number} */ (iaeBefore))} r="5" class="s-ink" />`}
     ${points.length > 0 && html`<circle key="dot" cx=${x(ms)} cy=${y(iae)} r="6" class="f-new" />`}
     <text x="12" y="14">faster disturbance rejection ↑</text>
-    ${msBefore !== null && !inside && html`<text key="off" x=${msBefore > high ? width - 8 : 8} y="124" text-anchor=${msBefore > high ? "end" : "start"}>before: Ms ${msText(msBefore)} ${msBefore > high ? "→" : "←"}</text>`}
+    ${msBefore !== null && !inside && html`<text key="off" x=${msBefore > high ? width - 8 : 8} y="124" text-anchor=${msBefore > high ? "end" : "start"}>previous: Ms ${msText(msBefore)} ${msBefore > high ? "→" : "←"}</text>`}
   </svg>`;
 }
 

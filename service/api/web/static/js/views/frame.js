@@ -13,7 +13,7 @@ import { AlarmSymbol } from "../symbols.js";
 import { stageName } from "../words.js";
 import { keysShown } from "./keys.js";
 
-const PLACES = [["/ui/", "Loops"], ["/ui/jobs", "Jobs"], ["/ui/retunes", "Retunes"]];
+const PLACES = [["/ui/", "Loops"], ["/ui/jobs", "Jobs"], ["/ui/batches", "Batches"]];
 
 export function Bar() {
   const at = path.value;
@@ -31,7 +31,7 @@ export function Bar() {
       <a href="/ui/alarms"><span class="hidden-words">${!all ? "Alarms" : some.length ? `${all.length} active ${all.length === 1 ? "alarm" : "alarms"}: ` : ""}</span>
         ${some.length ? some.map(([priority, count]) => html`<span key=${priority} class="count">${AlarmSymbol(/** @type {1|2|3} */ (priority))} ${count}</span>`) : html`<svg class="calm-sign" viewBox="0 0 20 20" aria-hidden="true"><path d="M10 2.5 18 17H2Z" class="s-line" /></svg><span class="calmness">${all ? "No active alarms" : "…"}</span>`}
       </a>
-      <span class="who">${session.value && html`${service.value && service.value.host !== session.value.name ? `${service.value.host} · ` : ""}<b>${session.value.name}</b> · ${session.value.scope}`}</span>
+      <span class="who">${session.value && html`${service.value && service.value.gateway !== session.value.name ? `${service.value.gateway} · ` : ""}<b>${session.value.name}</b> · ${session.value.scope}`}</span>
       <button class="plain" onClick=${() => (keysShown.value = !keysShown.value)} aria-label="Keys" aria-keyshortcuts="?" title="keys of this page">?</button>
       <button class="plain" onClick=${cyclePalette} aria-label=${`Colours: ${palette.value}`}>◑ <span class="who">${palette.value}</span></button>
       ${signOutError.value && html`<span key="error" role="alert">${signOutError.value}</span>`}
@@ -57,7 +57,7 @@ async function signOut() {
 export function Banner() {
   if (isSilent.value) {
     return html`<div class="banner" role="alert" key="silent">${AlarmSymbol(2)}
-      <span><b>No word from the service for ${silent_s.value} s.</b> What is shown is old. If the service has ended, it has ended its tests too, or the controllers do so by themselves, and the loops are as before; if only this screen has lost it, tests go on.</span></div>`;
+      <span><b>Service offline for ${silent_s.value} s.</b> What is shown is old. If the service has ended, it has ended its tests too, or the controllers do so by themselves, and the loops are as before; if only this screen has lost it, tests go on.</span></div>`;
   }
   if (newerVersion.value) {
     return html`<div class="banner calm" role="status" key="newer"><span>Loopwright was updated.</span><button onClick=${() => location.reload()}>Reload</button></div>`;

@@ -33,7 +33,7 @@ export function LoopView({ tag }) {
   const [open, setOpen] = useState(/** @type {boolean | null} */ (null));
   const job = jobs.value.find((each) => each.loop === tag && !each.dry_run) ?? null;
   const row = rowOf(tag).value;
-  const mark = `${row?.job ?? ""} ${row?.last_job?.url ?? ""} ${row?.last_job?.state ?? ""} ${loop?.locked?.since ?? ""} ${row?.not_heard ? "not heard" : ""}`;
+  const mark = `${row?.job ?? ""} ${row?.last_job?.url ?? ""} ${row?.last_job?.state ?? ""} ${loop?.locked?.since ?? ""} ${row?.no_data ? "not heard" : ""}`;
 
   useEffect(() => {
     document.title = `${tag} · Loopwright`;
@@ -101,8 +101,8 @@ export function LoopView({ tag }) {
     </div>
     ${mine.map((each) => html`<div class="loop-alarm" key=${each.id}>${AlarmSymbol(each.priority)}<span><b>${each.text}.</b> <span class="quiet">${each.advice}</span></span>${AcknowledgeButton(each)}
       ${asking.value === each.id && html`<${AcknowledgeQuestion} key="question" alarm=${each} />`}</div>`)}
-    ${elsewhere && row?.not_heard && !isSilent.value && !mine.some((each) => each.kind === "gateway_silent") && html`<p class="refusal" key="gateway" role="status"><b>${row.not_heard}.</b></p>`}
-    ${detail?.not_confirmed_home && html`<p class="refusal" key="home">${sentence(detail.not_confirmed_home.advice)}</p>`}
+    ${elsewhere && row?.no_data && !isSilent.value && !mine.some((each) => each.kind === "gateway_offline") && html`<p class="refusal" key="gateway" role="status"><b>${row.no_data}.</b></p>`}
+    ${detail?.restore_unconfirmed && html`<p class="refusal" key="home">${sentence(detail.restore_unconfirmed.advice)}</p>`}
     ${loop.locked && html`<p class="refusal" key="lock">Locked by ${loop.locked.by} since ${when(loop.locked.since)}: ${loop.locked.reason}. Tests and decisions wait until it is unlocked. ${may.operate.value && html`<${Unlock} key="unlock" tag=${tag} />`}</p>`}
     <div class="loop" key="loop">
       <aside key="aside"><${Face} key="face" loop=${loop} />${Settings(loop, detail)}<${Known} key="known" loop=${loop} detail=${detail} />${Tests(tests)}</aside>
@@ -185,5 +185,5 @@ function Settings(loop, detail) {
 function Tests(tests) {
   return html`<section class="card tests" key="tests"><h2 class="title">Earlier tests</h2>
     ${tests.length ? html`<ul class="tests">${tests.slice(0, 6).map((each) => html`<li key=${each.id}><a href=${jobPath(each.url)}>${when(each.ended_at ?? each.created_at)}</a>
-      <small>${each.dry_run ? "rehearsal · " : ""}${stateWords(each)}${known(each.request.ms) ? ` · Ms ${ms(each.request.ms)}` : ""}</small></li>`)}</ul>` : html`<p class="quiet">none yet</p>`}</section>`;
+      <small>${each.dry_run ? "rehearsal · " : ""}${stateWords(each)}${known(each.request.Ms) ? ` · Ms ${ms(each.request.Ms)}` : ""}</small></li>`)}</ul>` : html`<p class="quiet">none yet</p>`}</section>`;
 }

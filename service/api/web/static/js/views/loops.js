@@ -89,7 +89,7 @@ export function LoopsView() {
         ${groups.size > 1 || name ? html`<tr class="area" key="area"><th colspan="11" scope="rowgroup">${name || "No area"}</th></tr>` : null}
         ${members.map((loop) => html`<${Row} key=${loop.tag} loop=${loop} />`)}</tbody>`)}
     </table></div>` : html`<p class="calm" key="none">${onlyLook.value && !find.value ? "No loop needs attention." : "No loop is found by this."}</p>`}
-    ${buses.value.filter((each) => each.up === false).map((each) => html`<p class="busline" key=${`${each.host} ${each.bus}`}>${AlarmSymbol(2)}<span>Bus <b>${each.bus}</b>${isElsewhere(each) ? ` of gateway ${each.host}` : ""} is down, opening it again every 2 s. <span class="quiet">${sentence(each.why ?? "")}</span></span></p>`)}
+    ${buses.value.filter((each) => each.up === false).map((each) => html`<p class="busline" key=${`${each.gateway} ${each.bus}`}>${AlarmSymbol(2)}<span>Bus <b>${each.bus}</b>${isElsewhere(each) ? ` of gateway ${each.gateway}` : ""} is down, opening it again every 2 s. <span class="quiet">${sentence(each.why ?? "")}</span></span></p>`)}
   </div>`;
 }
 
@@ -140,7 +140,7 @@ function Tuning(loop, job) {
   if (loop.gains_differ) return html`<span class="tuning">gains differ from the accepted</span>`;
   if (last.state === "proposed") return html`<span class="tuning"><b>awaiting decision</b> ${at}</span>`;
   if (last.state === "accepted") return html`<span class="tuning">${known(loop.accepted?.ms) ? `Ms ${ms(loop.accepted.ms)}` : "accepted"} ${at}</span>`;
-  if (last.state === "rolled_back") return html`<span class="tuning">old gains in effect ${at}</span>`;
+  if (last.state === "rolled_back") return html`<span class="tuning">previous gains in effect ${at}</span>`;
   if (last.state === "no_gain") return html`<span class="tuning">no improvement ${at}</span>`;
   const word = last.state === "aborted" ? "stopped" : last.state;
   return html`<span class="tuning">${word}${last.reason ? `: ${reasonWords(last.reason)}` : ""} ${at}</span>`;

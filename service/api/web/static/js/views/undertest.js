@@ -18,7 +18,7 @@ export function UnderTest({ loop, live, job }) {
     ${job ? Stages(job, loop.pv_unit, live.stage ?? "") : html`<p class="quiet" key="asking">Asking for the stages…</p>`}
     ${job?.attempts > 1 && html`<p class="note" key="resumed">Resumed after a restart of the service: the stages begin anew.</p>`}
     ${job?.notes.map((/** @type {string} */ note) => html`<p class="note" key=${note}>${sentence(note)}</p>`)}
-    <p class="quiet who-asked" key="who">Asked for by ${live.requested_by}.</p>
+    <p class="quiet who-asked" key="who">Asked for by ${live.by}.</p>
   </section>`;
 }
 
