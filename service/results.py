@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, computed_field
 from loopwright.service.jsonable import JsonObject
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction, time_constants
+from loopwright.tuning.reduction.process_parameters import parameters
 
 DESIGNED = ("fast", "setpoint")
 """The methods that fit a model to one record and design the gains on it."""
@@ -127,12 +128,25 @@ class ModelView(Figures):
         return SOPDT(self.K, self.T_s, self.zeta, self.L_s)
 
 
+class ParameterView(Figures):
+    """A parameter of a process model, as controllers and their manuals have it."""
+
+    name: str = Field(
+        description="K: process gain; Kv: velocity gain of an integrating process; T, T1, T2: time constants; zeta: "
+        "damping ratio; Tz: time constant of a zero; L: dead time",
+        examples=["T1"],
+    )
+    value: float
+    error: float | None = Field(description="Standard error; null: the model was typed in")
+    unit: str = Field(description="PV/MV, PV/(MV s), s, or empty; PV in its unit, MV in percent", examples=["s"])
+
+
 class TransferModelView(Figures):
     """The model num(s)/den(s) exp(-dead_time_s s) that method fast identifies. Coefficients are by falling powers of s;
     den begins with 1.
 
-    The model has no static gain and no time constants, because a short record of a slow plant hardly determines them
-    and the gains do not depend on them.
+    Its coefficients are what the record determines; gain and time constants (`parameters`) follow from them, and have
+    large errors where a short record of a slow plant hardly determines them. The gains do not depend on them.
     """
 
     structure: str = Field(description="Model structure that the record supports best, or typed in", examples=["sopdt"])
@@ -165,6 +179,17 @@ class TransferModelView(Figures):
             return len(self.den) > 1
         *rest, slowest = sorted(map(float, time_constants(self.process_model())))
         return slowest > NEVER_SEEN * (self.dead_time_s + sum(rest)) > 0.0
+
+    @computed_field(  # type: ignore[prop-decorator]
+        description="The same model as gain, time constants and dead time, with K first and L last; of an integrating "
+        "one with its velocity gain; empty: it has a pole on the right, or more than one zero"
+    )
+    @property
+    def parameters(self) -> list[ParameterView]:
+        return [
+            ParameterView(name=each.name, value=each.value, error=each.error, unit=each.unit)
+            for each in parameters(self.num, self.den, self.dead_time_s, self.integrating, self.covariance)
+        ]
 
     @property
     def named(self) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import hypot
 
 from pydantic import BaseModel, ConfigDict
 from rich.table import Table
@@ -31,8 +30,6 @@ _PREDICTED = (
 )
 """Figures of a job of an earlier version, which has no comparison."""
 _NOTHING = ("", "-")
-_LAG_ERROR_MAX = 0.1
-"""Standard error of the lag, as a part of it, up to which a model of first order is shown as K, T and L."""
 _MS_SHOWN = 0.001
 
 
@@ -145,37 +142,17 @@ def _predicted(job: ShownResult, pv_unit: str, mv_unit: str) -> Iterator[tuple[s
 
 def _model(model: ModelView | TransferModelView | None, pv_unit: str, mv_unit: str) -> Iterator[tuple[str, str, str]]:
     """Yields lines of the table: label, value, unit."""
-    if model is None:
-        return
-    first_order = _first_order(model)
-    if first_order is not None:
-        for name, value, unit in zip("KTL", first_order, (f"{pv_unit} per {mv_unit}", "s", "s"), strict=True):
-            yield f"model {name}", value, unit
-    if first_order is not None or not isinstance(model, TransferModelView):
-        return
-    for label, coefficients, errors, unit in (
-        ("model num", model.num, model.num_errors, f"{pv_unit} per {mv_unit}"),
-        ("model den", model.den, model.den_errors, ""),
-    ):
-        known = errors or [0.0] * len(coefficients)
-        yield label, " ".join(map(_with_error, coefficients, known)), unit
-    yield "model dead time", _with_error(model.dead_time_s, model.dead_time_error_s), "s"
-
-
-def _first_order(model: ModelView | TransferModelView) -> tuple[str, ...] | None:
-    """Returns K, T and L of a model of first order whose lag the record determines; None for any other model."""
-    if not isinstance(model, TransferModelView):
-        return tuple(figure(model, name) for name in ("K", "T_s", "L_s"))
-    if len(model.num) != 1 or len(model.den) != 2 or model.den[1] <= 0.0:
-        return None
-    (b,), (_, a) = model.num, model.den
-    error = 0.0 if model.den_errors is None else model.den_errors[1] / a
-    if error > _LAG_ERROR_MAX:
-        return None
-    gain_error = 0.0 if model.num_errors is None else abs(model.num_errors[0] / b)
-    K, T = b / a, 1.0 / a
-    shown = (K, abs(K) * hypot(error, gain_error)), (T, T * error), (model.dead_time_s, model.dead_time_error_s)
-    return tuple(_with_error(*each) for each in shown)
+    if isinstance(model, ModelView):
+        for name, field, unit in (("K", "K", f"{pv_unit} per {mv_unit}"), ("T", "T_s", "s"), ("L", "L_s", "s")):
+            yield f"model {name}", figure(model, field), unit
+    elif model is not None:
+        for each in model.parameters:
+            unit = each.unit.replace("PV", pv_unit).replace("MV", mv_unit).replace("/", " per ")
+            yield f"model {each.name}", _with_error(each.value, each.error), unit
+        if not model.parameters:
+            yield "model num", " ".join(map(_with_error, model.num, model.num_errors or [0.0] * len(model.num))), ""
+            yield "model den", " ".join(map(_with_error, model.den, model.den_errors or [0.0] * len(model.den))), ""
+            yield "model dead time", _with_error(model.dead_time_s, model.dead_time_error_s), "s"
 
 
 def _with_error(value: float, error: float | None) -> str:

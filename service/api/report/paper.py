@@ -355,6 +355,17 @@ def _no_record(source: ReportSource) -> str:
     return "There is no record: the job ended before its second sample."
 
 
+_PARAMETERS = {
+    "K": "process gain K", "Kv": "velocity gain Kv", "T": "time constant T", "T1": "time constant T1",
+    "T2": "time constant T2", "zeta": "damping", "Tz": "zero, time constant Tz", "L": "dead time L",
+}  # fmt: skip
+"""Names of the parameters of a model; the page has the same."""
+
+
+def _with_its_unit(text: str, unit: str, pv_unit: str) -> str:
+    return n.with_unit(text, unit.replace("PV", n.unit(pv_unit)).replace("MV", "%")) if unit else text
+
+
 def _model_rows(source: ReportSource, pv_unit: str) -> list[Row]:
     job = source.job
     rows: list[Row] = []
@@ -362,12 +373,23 @@ def _model_rows(source: ReportSource, pv_unit: str) -> list[Row]:
     if isinstance(model, TransferModelView):
         rows += [
             ("structure", model.named, False),
-            ("dead time", n.with_unit(n.with_error(model.dead_time_s, model.dead_time_error_s), "s"), False),
-            ("numerator", f"{n.list_with_errors(model.num, model.num_errors)} ({pv_unit}/%)", True),
-            ("denominator", n.list_with_errors(model.den, model.den_errors), True),
+            *(
+                (
+                    _PARAMETERS[each.name],
+                    _with_its_unit(n.with_error(each.value, each.error), each.unit, pv_unit),
+                    False,
+                )
+                for each in model.parameters
+            ),
         ]
+        if not model.parameters:
+            rows += [
+                ("dead time L", n.with_unit(n.with_error(model.dead_time_s, model.dead_time_error_s), "s"), False),
+                ("numerator", f"{n.list_with_errors(model.num, model.num_errors)} ({pv_unit}/%)", True),
+                ("denominator", n.list_with_errors(model.den, model.den_errors), True),
+            ]
     elif model is not None:
-        rows.append(("gain K", f"{n.significant(model.K)} {pv_unit}/%", False))
+        rows.append(("process gain K", f"{n.significant(model.K)} {pv_unit}/%", False))
         rows.append(("time constant T", n.with_unit(n.significant(model.T_s), "s"), False))
         rows.append(("dead time L", n.with_unit(n.significant(model.L_s), "s"), False))
         rows += [("damping", n.significant(model.zeta), False)] if model.zeta is not None else []

@@ -220,7 +220,7 @@ def test_a_job_and_its_picture_and_another_Ms(rehearsed: str, tmp_path: Path) ->
     shown = run("job", rehearsed, "--plot", str(picture))
     assert shown.exit_code == 0, shown.output
     assert picture.stat().st_size > 20_000
-    for words in ("predicted overshoot", "model num", "uncertainty of Ms", "fit of measured step"):
+    for words in ("predicted overshoot", "model K", "uncertainty of Ms", "fit of measured step"):
         assert words in shown.output
     found = run("alternatives", rehearsed, "--ms", "1.4", "--json")
     (fast,) = json.loads(found.stdout)["methods"]

@@ -54,6 +54,12 @@ function After(loop, job) {
   return html`<p class="quiet">The loop was left in ${r.mode}${r.mode === "manual" ? ` at MV ${withUnit(fixed(r.manual_output, 1), "%")}` : ""}, set-point ${withUnit(fixed(r.sp, pvDecimals(loop.pv_limits)), unit(loop.pv_unit))}${r.gains ? `, Kp ${significant(r.gains.Kp)}, Ti ${significant(r.gains.Ti)} s` : ""}, read back.</p>`;
 }
 
+/** Names of the parameters of a model; the report has the same. @type {Record<string, string>} */
+const PARAMETERS = {
+  K: "process gain K", Kv: "velocity gain Kv", T: "time constant T", T1: "time constant T1", T2: "time constant T2",
+  zeta: "damping", Tz: "zero, time constant Tz", L: "dead time L",
+};
+
 /** @param {any} loop @param {any} job */
 function Numbers(loop, job) {
   const u = unit(loop.pv_unit);
@@ -61,7 +67,11 @@ function Numbers(loop, job) {
   const rows = [];
   const m = job.model;
   const list = (/** @type {number[]} */ values, /** @type {number[] | null} */ errors) => values.map((value, n) => withError(value, errors?.[n])).join(", ");
-  if (m?.num) rows.push(["model", m.structure === "typed in" ? "given with the request" : m.integrating ? `integrating as far as the record shows (${m.structure})` : m.structure], ["numerator", list(m.num, m.num_errors)], ["denominator", list(m.den, m.den_errors)], ["dead time", withUnit(withError(m.dead_time_s, m.dead_time_error_s), "s")]);
+  if (m?.num) {
+    rows.push(["model", m.structure === "typed in" ? "given with the request" : m.integrating ? `integrating as far as the record shows (${m.structure})` : m.structure]);
+    for (const each of m.parameters) rows.push([PARAMETERS[each.name], each.unit ? withUnit(withError(each.value, each.error), each.unit.replace("PV", u).replace("MV", "%")) : withError(each.value, each.error)]);
+    if (!m.parameters.length) rows.push(["numerator", list(m.num, m.num_errors)], ["denominator", list(m.den, m.den_errors)], ["dead time L", withUnit(withError(m.dead_time_s, m.dead_time_error_s), "s")]);
+  }
   else if (m) rows.push(["model", `K ${significant(m.K)} ${u}/%, T ${significant(m.T_s)} s, dead time ${significant(m.L_s)} s${known(m.zeta) ? `, damping ${significant(m.zeta)}` : ""}`]);
   if (known(m?.fit_pct)) rows.push(["fit", `${fixed(m.fit_pct, 1)} %`]);
   if (job.ultimate) rows.push(["ultimate point", `Ku ${significant(job.ultimate.Ku)} %/${u}, Pu ${significant(job.ultimate.Pu_s)} s`]);
