@@ -103,7 +103,7 @@ def fleet(folder: Path, gateways: int, server: Server, pace: float, at_once: int
         def retune(n: int) -> None:
             # Each asked at another gateway than the one that runs it, where there is another.
             at, loop = clients[(n + 1) % gateways], f"gw{n % gateways}-{n // gateways}"
-            body = {"method": "five-stage", "baseline": False, "requested_by": "benchmark"}
+            body = {"method": "five-stage", "baseline": False, "by": "benchmark"}
             at.post(f"/loops/{loop}/retune", json=body).raise_for_status()
 
         def used() -> float:

@@ -53,7 +53,7 @@ STAND_IN = r"""(() => {
   let n = 0;
   const pv = (at_s, loop) => 50 + Math.sin(at_s / (3 + loop % 7));
   const job = (heard, tag, s) => s % 300 < 60 ? [{ id: "0123456789ab", url: "/jobs/0123456789ab", loop: tag,
-    host: heard.hello.host, state: "running", dry_run: true, requested_by: "bench", stage: "relay",
+    host: heard.hello.host, state: "running", dry_run: true, by: "bench", stage: "relay",
     progress: (s % 300) / 60, remaining_plant_time_s: 60 - s % 300, plant_time_s: s % 300, stopping: false }] : [];
   window.passSeconds = async (seconds, heard) => {
     for (let s = 0; s < seconds; s++) {
@@ -63,7 +63,7 @@ STAND_IN = r"""(() => {
         if (tenth === 0) {
           if (!n) { send("hello", { ...heard.hello, now_s: at_s }); send("buses", heard.buses); }
           send("loops", { now_s: at_s, loops: heard.loops.loops.map((row, k) => ({ ...row, pv: pv(at_s, k), sp: 50,
-            mv: 50 + k % 9, mode: "automatic", age_s: 0.05, not_heard: null })) });
+            mv: 50 + k % 9, mode: "automatic", age_s: 0.05, no_data: null })) });
           send("jobs", { jobs: job(heard, heard.loops.loops[0].tag, s) });
         }
         n++;

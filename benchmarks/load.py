@@ -90,7 +90,7 @@ class Site:
         self.http = stack.enter_context(httpx.Client(base_url=self.url, timeout=60.0, trust_env=False))
 
     def retune_all(self, method: str) -> list[str]:
-        asked = REQUESTS[method] | {"requested_by": "benchmark"}
+        asked = REQUESTS[method] | {"by": "benchmark"}
         answers = [self.http.post(f"/loops/T-{n}/retune", json=asked).raise_for_status() for n in range(self.loops)]
         return [answer.headers["location"] for answer in answers]
 

@@ -207,7 +207,7 @@ def viewed(stack: ExitStack, folder: Path) -> dict[str, Any]:
     site.until_heard()
     beats = Heartbeats(site.bus)
     stack.callback(beats.stop)
-    body = {"requested_by": "benchmark", "method": "five-stage"}
+    body = {"by": "benchmark", "method": "five-stage"}
     asked = site.http.post(f"/loops/{RETUNED}/retune", json=body).raise_for_status()
     job = str(asked.headers["location"])
     while site.http.get(job).json()["stage"] is None:

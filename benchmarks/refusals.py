@@ -171,7 +171,7 @@ def rehearsed(case: Case) -> tuple[RehearsedJob, RehearsalRecord]:
         detail=ended.detail if ended else None,
         advice=ended.advice if ended else None,
         model=None if result is None else result.model,
-        old_gains=GainsView.of(case.gains),
+        previous_gains=GainsView.of(case.gains),
         new_gains=None if result is None else result.new_gains,
         evidence=found,
         verification=None,

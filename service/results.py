@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, computed_field
 from loopwright.service.jsonable import JsonObject
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction, time_constants
+from loopwright.tuning.reduction.process_parameters import parameters
 
 DESIGNED = ("fast", "setpoint")
 """The methods that fit a model to one record and design the gains on it."""
@@ -127,12 +128,25 @@ class ModelView(Figures):
         return SOPDT(self.K, self.T_s, self.zeta, self.L_s)
 
 
+class ParameterView(Figures):
+    """A parameter of a process model, as controllers and their manuals have it."""
+
+    name: str = Field(
+        description="K: process gain; Kv: velocity gain of an integrating process; T, T1, T2: time constants; zeta: "
+        "damping ratio; Tz: time constant of a zero; L: dead time",
+        examples=["T1"],
+    )
+    value: float
+    error: float | None = Field(description="Standard error; null: the model was typed in")
+    unit: str = Field(description="PV/MV, PV/(MV s), s, or empty; PV in its unit, MV in percent", examples=["s"])
+
+
 class TransferModelView(Figures):
     """The model num(s)/den(s) exp(-dead_time_s s) that method fast identifies. Coefficients are by falling powers of s;
     den begins with 1.
 
-    The model has no static gain and no time constants, because a short record of a slow plant hardly determines them
-    and the gains do not depend on them.
+    Its coefficients are what the record determines; gain and time constants (`parameters`) follow from them, and have
+    large errors where a short record of a slow plant hardly determines them. The gains do not depend on them.
     """
 
     structure: str = Field(description="Model structure that the record supports best, or typed in", examples=["sopdt"])
@@ -147,7 +161,7 @@ class TransferModelView(Figures):
     covariance: list[list[float]] | None = Field(
         default=None,
         description="Covariance of num, of den without its leading 1 and of the dead time, in this order; null: typed "
-        "in, or an earlier version has found it",
+        "in",
     )
 
     @property
@@ -165,6 +179,17 @@ class TransferModelView(Figures):
             return len(self.den) > 1
         *rest, slowest = sorted(map(float, time_constants(self.process_model())))
         return slowest > NEVER_SEEN * (self.dead_time_s + sum(rest)) > 0.0
+
+    @computed_field(  # type: ignore[prop-decorator]
+        description="The same model as gain, time constants and dead time, with K first and L last; of an integrating "
+        "one with its velocity gain; empty: it has a pole on the right, or more than one zero"
+    )
+    @property
+    def parameters(self) -> list[ParameterView]:
+        return [
+            ParameterView(name=each.name, value=each.value, error=each.error, unit=each.unit)
+            for each in parameters(self.num, self.den, self.dead_time_s, self.integrating, self.covariance)
+        ]
 
     @property
     def named(self) -> str:
@@ -206,7 +231,7 @@ class EvidenceView(Figures):
     longest_delay_seen_s: float | None = Field(
         default=None,
         description="How much later a second path of 30 % of MV's effect may act and still show in the record, s; "
-        "null: not known, of a job of an earlier version",
+        "null: not known",
         examples=[48.0],
     )
 
@@ -259,7 +284,7 @@ class StepPerformanceView(Figures):
     TV: float = Field(description="Total variation of MV. Set-point: percent per PV unit. Load: 1 at least")
     mv_peak: float | None = Field(
         default=None,
-        description="Largest change of MV. Set-point: percent per PV unit. null: an earlier version has computed it",
+        description="Largest change of MV. Set-point: percent per PV unit. null: not computed",
     )
 
 
@@ -273,8 +298,7 @@ class PerformanceView(Figures):
     PM_deg: float | None = Field(description="Phase margin, degrees; null: no crossing")
     delay_margin_s: float | None = Field(
         default=None,
-        description="Further dead time at which the loop becomes unstable, s; null: there is none, or an earlier "
-        "version has computed it",
+        description="Further dead time at which the loop becomes unstable, s; null: there is none",
     )
     noise_gain: float | None = Field(description="Immediate change of MV for a jump of PV, percent per PV unit")
     overshoot_pct: float | None = Field(description="Overshoot of a set-point step, percent")
@@ -285,13 +309,13 @@ class PerformanceView(Figures):
 class ComparisonView(Figures):
     """The present and the new gains on the identified model, and whether the new gains meet the request better."""
 
-    before: PerformanceView = Field(description="Performance of the present gains")
-    after: PerformanceView = Field(description="Performance of the new gains")
+    previous: PerformanceView = Field(description="Performance of the present gains")
+    new: PerformanceView = Field(description="Performance of the new gains")
     Ms_asked: float = Field(description="Requested upper bound of Ms", examples=[1.6])
     settling_s_asked: float | None = Field(
         default=None,
         description="Longest settling time asked for, after a set-point step into 5 %, s; null: none was. What the "
-        "gains reach is in `before` and `after`, setpoint.settling_s",
+        "gains reach is in `previous` and `new`, setpoint.settling_s",
         examples=[300.0],
     )
     mv_peak_asked: float | None = Field(
@@ -303,10 +327,10 @@ class ComparisonView(Figures):
         default=None, description="Largest noise gain asked for, percent per PV unit; null: none was"
     )
     criterion: str = Field(description="The criterion J that the method minimises", examples=["criterion (7)"])
-    J_before: float | None = Field(
+    J_previous: float | None = Field(
         description="J of the present gains; null: the loop is not stable, or an offset remains"
     )
-    J_after: float | None = Field(description="J of the new gains; null: an offset remains")
+    J_new: float | None = Field(description="J of the new gains; null: an offset remains")
     gain: bool = Field(
         description="True when the new gains meet a robustness bound that the present gains violate, or when J falls "
         "by more than 5 %. If false, nothing is proposed unless propose_anyway is set"
@@ -384,7 +408,7 @@ class KnowledgeView(Figures):
     )
     source: FindingSource = Field(
         description="operation: set-point changes of normal operation; job: a test; trial: operation or a test, whose "
-        "gains were then tried on the loop and accepted"
+        "gains were then tested on the loop and accepted"
     )
     source_text: str = Field(description="The same in words", examples=["3 set-point changes of normal operation"])
     changes: int | None = Field(description="Number of set-point changes of normal operation; null: it was a test")
@@ -397,8 +421,8 @@ class KnowledgeView(Figures):
         description="The gains that were proposed then, or found no better; null: none, or they are in effect"
     )
     Ms_asked: float | None = Field(description="Upper bound of Ms for which these were designed", examples=[1.6])
-    agreeing: int = Field(description="Number of further findings that agree", examples=[2])
-    older_plant: str | None = Field(
+    consistent: int = Field(description="Number of further findings that agree", examples=[2])
+    superseded: str | None = Field(
         description="Why the latest earlier finding that does not agree is of an older plant; null: there is none"
     )
 
@@ -407,11 +431,11 @@ class _Result(Figures):
     """The fields of the results of both procedures. A field is null if the retune did not get that far."""
 
     method: str = Field(description="Method that computes the gains", examples=["fast"])
-    chosen: dict[str, float] = Field(
+    design: dict[str, float] = Field(
         default_factory=dict, description="Design parameters of the method in effect; the names carry the units"
     )
     ultimate: UltimateView | None = Field(default=None, description="The ultimate point")
-    old_gains: GainsView | None = Field(default=None, description="The gains before the test")
+    previous_gains: GainsView | None = Field(default=None, description="The gains before the test")
     new_gains: GainsView | None = Field(default=None, description="The gains proposed or rehearsed, or found no better")
     comparison: ComparisonView | None = Field(
         default=None, description="Comparison of the present and the new gains on the model"
@@ -420,7 +444,9 @@ class _Result(Figures):
     predicted: PredictedView | None = Field(
         default=None, description="Predicted performance of the new gains on the model"
     )
-    after: StepView | None = Field(default=None, description="Measured set-point step with the new gains, from rest")
+    step_after: StepView | None = Field(
+        default=None, description="Measured set-point step with the new gains, from rest"
+    )
     notes: list[str] = Field(default_factory=list, description="Notes for the operator")
 
 
@@ -429,18 +455,18 @@ class FastResult(_Result):
 
     procedure: Literal["fast"] = "fast"
     model: TransferModelView | None = None
-    predicted_before: PredictedView | None = Field(
-        default=None, description="Predicted performance of the old gains; null: the loop is not stable with them"
+    predicted_previous: PredictedView | None = Field(
+        default=None, description="Predicted performance of the previous gains; null: the loop is not stable with them"
     )
     model_from: str | None = Field(
         default=None,
-        description="Where the model comes from, in words; null: there is none, or an earlier version has found it",
+        description="Where the model comes from, in words; null: there is none",
         examples=["3 set-point changes of normal operation, from which Ms is known to +-0.03, and the step under the "
                   "new gains"],
     )  # fmt: skip
     evidence: EvidenceView | None = Field(default=None, description="Evidence from the record")
-    known_before: KnownMsView | None = Field(
-        default=None, description="Ms of the old gains; null: there is no record, or an earlier version has found it"
+    known_previous: KnownMsView | None = Field(
+        default=None, description="Ms of the previous gains; null: there is no record"
     )
     verification: VerificationView | None = Field(default=None, description="Measured step that verifies the model")
 
@@ -450,7 +476,7 @@ class FiveStageResult(_Result):
 
     procedure: Literal["five-stage"] = "five-stage"
     model: ModelView | None = None
-    before: StepView | None = Field(default=None, description="Measured set-point step with the old gains")
+    step_before: StepView | None = Field(default=None, description="Measured set-point step with the previous gains")
 
 
 Result = Annotated[FastResult | FiveStageResult, Field(discriminator="procedure")]

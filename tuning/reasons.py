@@ -63,7 +63,7 @@ class Reason(StrEnum):
     BUS_LOST = "bus_lost"
     GATEWAY_LOST = "gateway_lost"
     NODE_NOT_OPERATIONAL = "node_not_operational"
-    DEVICE_WENT_BACK = "device_went_back"
+    SESSION_ENDED_BY_DEVICE = "session_ended_by_device"
     RESTORE_UNCONFIRMED = "restore_unconfirmed"
     COMPUTATION_LIMIT = "computation_limit"
     COMPUTATION_LOST = "computation_lost"
@@ -133,31 +133,32 @@ ADVICE: dict[Reason, str] = {
     Reason.LOCKED: "Somebody has locked the loop: ask them, or unlock it on its page (or by loopwright unlock TAG), "
     "then ask again.",
     Reason.NOT_ACKNOWLEDGED: "The last test found PV to be false, and nobody has acknowledged that: check the sensor, "
-    "sign the alarm off (or loopwright dismiss TAG), then ask again.",
+    "acknowledge the alarm (or loopwright acknowledge TAG), then ask again.",
     Reason.NO_GAIN: "The loop is already tuned as well as asked: nothing needs to be done. For a faster or a more "
     "robust loop ask for another Ms, for a proposal all the same set propose_anyway.",
     Reason.PV_LIMIT: "PV reached its limit: permit less MV deviation, or widen the PV limits if it is safe.",
     Reason.TIME_BUDGET: "The test took longer than its budget: check T95, or raise the budget.",
     Reason.BAD_SAMPLE: "PV was not a finite number, or another one than the plant can give: check the sensor and its "
     "scaling. Where the message says that PV is false, see that the loop is in manual, and control it by hand; when PV "
-    "is right again, sign the alarm off (or loopwright dismiss TAG), put the loop in automatic, then retune.",
+    "is right again, acknowledge the alarm (or loopwright acknowledge TAG), put the loop in automatic, then retune.",
     Reason.SAMPLES_LOST: "Samples were lost on the way: check bus load, or run a simulated plant more slowly.",
     Reason.PV_FROZEN: "PV stood still, or had another noise, as the plant cannot: check the sensor, see that the loop "
-    "is in manual (the message says what it was left in), and control it by hand; when PV is right again, sign the "
-    "alarm off (or loopwright dismiss TAG), put the loop in automatic, then retune.",
+    "is in manual (the message says what it was left in), and control it by hand; when PV is right again, acknowledge "
+    "the alarm (or loopwright acknowledge TAG), put the loop in automatic, then retune.",
     Reason.SETPOINT_CHANGED: "Somebody else moved the set-point during the test; agree on the time and repeat.",
     Reason.MODE_CHANGED: "Somebody else changed the mode during the test; agree on the time and repeat.",
     Reason.GAINS_CHANGED: "Somebody else tried other gains during the test; agree on the time and repeat.",
-    Reason.NODE_LOST: "The device fell silent: check power and cable; it goes home by itself.",
+    Reason.NODE_LOST: "The device sends no data: check power and cable; it restores the loop by itself.",
     Reason.NODE_NOT_ANSWERING: "The device sends heartbeats and answers no request, so it has power and a cable: see "
     "whether its SDO server hangs or is kept busy by another master, or the bus loses frames; start its program anew "
-    "when the loop permits. It goes home by itself.",
-    Reason.BUS_LOST: "Check the CAN interface, its name and whether it is up; the device goes home by itself.",
+    "when the loop permits. It restores the loop by itself.",
+    Reason.BUS_LOST: "Check the CAN interface, its name and whether it is up; the device restores the loop by itself.",
     Reason.GATEWAY_LOST: "The gateway of the loop alone reaches it: see that its service runs and reaches the "
     "database. What is under test there goes on, or ends safely by itself.",
     Reason.NODE_NOT_OPERATIONAL: "The node does not control: start it (NMT) and look at the loop; Loopwright looks at "
     "it again by itself, and sends no NMT command.",
-    Reason.DEVICE_WENT_BACK: "The controller ended the test by itself (lease, heartbeat): check this machine's load.",
+    Reason.SESSION_ENDED_BY_DEVICE: "The controller ended the test by itself (lease, heartbeat): check the load of "
+    "this machine.",
     Reason.RESTORE_UNCONFIRMED: "The loop could not be read back after the test: look at the controller NOW.",
     Reason.COMPUTATION_LIMIT: "Look for a number in the model or the options that is far from any plant's (gain, time "
     "constants, dead time against T95 and sample time), or have an administrator permit more by the option of "

@@ -15,7 +15,7 @@ from loopwright.tuning.gains import Gains
 
 ON_BUS = "bus"
 """The method of such a run, beside those of the rehearsals."""
-CUT_OFF = ("device_went_back", "node_lost", "samples_lost", "bad_sample")
+CUT_OFF = ("session_ended_by_device", "node_lost", "samples_lost", "bad_sample")
 """Reasons that are none of the procedure, on a bus without faults: the machine stood still for longer than a heartbeat,
 a lease or a sample may be missing."""
 

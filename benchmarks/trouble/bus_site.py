@@ -107,10 +107,10 @@ class TroubleSite:
         """Every loop with its job at its end and the job's samples. Raises RuntimeError."""
         for each in self.loops:
             asked = {
-                "method": "fast", "ms": ASKED, "amplitude_pct": TROUBLES[each.case.name].amplitude,
+                "method": "fast", "Ms": ASKED, "amplitude_pct": TROUBLES[each.case.name].amplitude,
                 "excitations": ["relay"], "propose_anyway": True,
             }  # fmt: skip
-            answer = self._http.post(f"/loops/{each.tag}/retune", json=asked | {"requested_by": "benchmark"})
+            answer = self._http.post(f"/loops/{each.tag}/retune", json=asked | {"by": "benchmark"})
             if answer.is_error:
                 raise RuntimeError(f"{each.plant.name}, {each.case.name}: {answer.text}")
             each.url = answer.headers["location"]

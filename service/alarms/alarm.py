@@ -1,4 +1,4 @@
-"""An alarm, and the closed list of its kinds, each with level and delays."""
+"""An alarm, and the closed list of its kinds, each with priority and delays."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Level = Literal[1, 2, 3]
-LEVELS: tuple[Level, ...] = (1, 2, 3)
+Priority = Literal[1, 2, 3]
+PRIORITIES: tuple[Priority, ...] = (1, 2, 3)
 
 
 class AlarmKind(StrEnum):
@@ -23,7 +23,7 @@ class AlarmKind(StrEnum):
     NO_DATA = "no_data"
     PV_OUTSIDE_LIMITS = "pv_outside_limits"
     FOREIGN_TEST = "foreign_test"
-    GATEWAY_SILENT = "gateway_silent"
+    GATEWAY_OFFLINE = "gateway_offline"
     SUSPECT_GAINS = "suspect_gains"
     ROLLED_BACK = "rolled_back"
     MODEL_MISMATCH = "model_mismatch"
@@ -35,15 +35,15 @@ class AlarmKind(StrEnum):
 class KindRule:
     """How alarms of a kind come and go.
 
-    level: 1 is the worst.
+    priority: 1 is the worst.
     on_s, off_s: on-delay and off-delay, s.
-    to_sign: whether a person may sign it off; an alarm that goes with its condition needs nobody.
+    to_acknowledge: whether a person may acknowledge it; an alarm that goes with its condition needs nobody.
     """
 
-    level: Level
+    priority: Priority
     on_s: float
     off_s: float
-    to_sign: bool
+    to_acknowledge: bool
 
 
 RULES: dict[AlarmKind, KindRule] = {
@@ -55,7 +55,7 @@ RULES: dict[AlarmKind, KindRule] = {
     AlarmKind.NO_DATA: KindRule(2, 3.0, 3.0, False),
     AlarmKind.PV_OUTSIDE_LIMITS: KindRule(2, 3.0, 3.0, False),
     AlarmKind.FOREIGN_TEST: KindRule(2, 5.0, 3.0, False),
-    AlarmKind.GATEWAY_SILENT: KindRule(2, 10.0, 3.0, False),
+    AlarmKind.GATEWAY_OFFLINE: KindRule(2, 10.0, 3.0, False),
     AlarmKind.SUSPECT_GAINS: KindRule(1, 0.0, 0.0, True),
     AlarmKind.ROLLED_BACK: KindRule(2, 0.0, 0.0, True),
     AlarmKind.MODEL_MISMATCH: KindRule(2, 0.0, 0.0, True),
@@ -64,42 +64,42 @@ RULES: dict[AlarmKind, KindRule] = {
 }
 
 
-class SignOff(BaseModel):
-    """Who has signed an alarm off."""
+class Acknowledgement(BaseModel):
+    """Who has acknowledged an alarm."""
 
     model_config = ConfigDict(frozen=True)
 
-    by: str = Field(description="Who has signed it off, as given in the request", examples=["operator A"])
+    by: str = Field(description="Who has acknowledged it, as given in the request", examples=["operator A"])
     at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
 
 
 class Alarm(BaseModel):
-    """Something abnormal."""
+    """Something that needs a look."""
 
     model_config = ConfigDict(frozen=True)
 
     id: str = Field(description="The same on every gateway, and as long as the alarm lasts", examples=["0f3ac2d9be11"])
-    level: Level = Field(description="1: look now, and sign off; 2: soon; 3: when there is time")
+    priority: Priority = Field(description="1: look now, and acknowledge; 2: soon; 3: when there is time")
     kind: AlarmKind
     subject: str = Field(
         description="The loop, the bus, the node or the gateway", examples=["TIC-101", "node 20h on socketcan:can0"]
     )
-    text: str = Field(description="What is abnormal", examples=["PV is above its limit of 51 degC"])
+    text: str = Field(description="What is wrong", examples=["PV is above its limit of 51 degC"])
     advice: str = Field(description="What the operator should do")
     since: str = Field(description="When it began: UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
-    host: str = Field(description="Name of the gateway that has the loop or the bus", examples=["local"])
+    gateway: str = Field(description="Name of the gateway that has the loop or the bus", examples=["local"])
     loop: str | None = Field(
         description="Tag of the loop; null: it is about a bus, a node or a gateway", examples=["TIC-101"]
     )
     loops: list[str] = Field(description="Tags of all loops that it concerns", examples=[["TIC-101"]])
     job: str | None = Field(description="URL of the test that it is about", examples=["/jobs/4f0c2a9be113"])
-    to_sign: bool = Field(
-        description="Whether it may be signed off; one that may not goes by itself when its cause is gone"
+    unacknowledged: bool = Field(
+        description="Whether it waits to be acknowledged; one that does not goes by itself when its cause is gone"
     )
-    signed_off: SignOff | None = Field(description="Who has signed it off, and when; null: nobody has")
+    acknowledged: Acknowledgement | None = Field(description="Who has acknowledged it, and when; null: nobody has")
 
 
 class AlarmList(BaseModel):
-    """Everything that is abnormal, the worst first."""
+    """The active alarms, the worst first."""
 
     alarms: list[Alarm]

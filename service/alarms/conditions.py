@@ -21,7 +21,7 @@ from loopwright.service.states.job_state import JobState
 from loopwright.service.states.loop_state import LoopState, loop_state, same_gains
 from loopwright.service.store.alarms import NOT_RESTORED_TEXT, FalsePvJob, UnconfirmedJob, alarm_id
 from loopwright.service.store.live_jobs import Acceptance, JobInBrief
-from loopwright.service.store.watches import AbnormalWatch
+from loopwright.service.store.watches import WatchWithAlarm
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode as PlanMode
 from loopwright.tuning.reasons import ADVICE, Reason
@@ -31,15 +31,15 @@ _NEVER_HEARD_OF_T95 = 0.2
 _NO_ANSWER = (JobState.FAILED, JobState.INTERRUPTED)
 _BUS_ADVICE = (
     "Check the interface and the cable. The bus is opened again every 2 s; controllers whose tests ran on it bring "
-    "their loops home by themselves."
+    "their loops by themselves."
 )
 _EAR_ADVICE = "It is started again by itself. Tests go on; what the loops do is not seen until then."
-_GATEWAY_ADVICE = f"{ADVICE[Reason.GATEWAY_LOST]} What is abnormal there is not known here meanwhile."
+_GATEWAY_ADVICE = f"{ADVICE[Reason.GATEWAY_LOST]} What alarms there are there is not known here meanwhile."
 _SEE_THE_JOB = "See the job."
 _WHEN_PV_IS_RIGHT = (
-    "Check the sensor, and control the loop by hand; when PV is right again, sign this off and put it in automatic."
+    "Check the sensor, and control the loop by hand; when PV is right again, acknowledge this and put it in automatic."
 )
-_UNTIL_SIGNED = "It stays until somebody signs it off."
+_UNTIL_ACKNOWLEDGED = "It stays until somebody acknowledges it."
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class AlarmFacts:
     unconfirmed: tests of every gateway after which the loop was not confirmed to be as before.
     false_pvs: tests of every gateway that have found PV to be false.
     watches: those after acceptances, of every gateway, that have found something.
-    signed: ids of alarms that were signed off, of those in `to_be_asked`.
+    acknowledged: ids of alarms that were acknowledged, of those in `to_be_asked`.
     """
 
     host: str
@@ -114,8 +114,8 @@ class AlarmFacts:
     tests: Sequence[JobInBrief] = ()
     unconfirmed: Sequence[UnconfirmedJob] = ()
     false_pvs: Sequence[FalsePvJob] = ()
-    watches: Sequence[AbnormalWatch] = ()
-    signed: frozenset[str] = frozenset()
+    watches: Sequence[WatchWithAlarm] = ()
+    acknowledged: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -148,14 +148,14 @@ def conditions(known: AlarmFacts) -> list[Condition]:
     up_s = {bus.url: bus.up_s for bus in known.buses if bus.why is None}
     for loop in known.loops:
         found += _of_loop(known.host, loop, up_s.get(loop.config.bus), loop.config.tag in explained)
-    return [each for each in found if each.id not in known.signed]
+    return [each for each in found if each.id not in known.acknowledged]
 
 
 def to_be_asked(known: AlarmFacts) -> set[str]:
-    """Returns the ids of the alarms of which it matters here whether they were signed off."""
+    """Returns the ids of the alarms of which it matters here whether they were acknowledged."""
     ended = {each for test in known.tests if test.state in _NO_ANSWER for each in _of_the_end(test.id)}
-    theirs = {alarm.id for gateway in known.gateways for alarm in gateway.alarms if alarm.to_sign}
-    return ended | theirs | {each.id for each in conditions(known) if RULES[each.kind].to_sign}
+    theirs = {alarm.id for gateway in known.gateways for alarm in gateway.alarms if alarm.unacknowledged}
+    return ended | theirs | {each.id for each in conditions(known) if RULES[each.kind].to_acknowledge}
 
 
 def _tests(known: AlarmFacts) -> Iterator[Condition]:
@@ -165,17 +165,19 @@ def _tests(known: AlarmFacts) -> Iterator[Condition]:
         text, advice = _false_pv(found)
         yield Condition(
             alarm_id(AlarmKind.FALSE_PV, found.id), AlarmKind.FALSE_PV, found.loop, text,
-            f"{advice} No test begins until somebody signs this off.", found.host, found.loop, (found.loop,),
+            f"{advice} No test begins until somebody acknowledges this.", found.host, found.loop, (found.loop,),
             f"/jobs/{found.id}", _seconds(found.at),
         )  # fmt: skip
     for job in known.unconfirmed:
         text = NOT_RESTORED_TEXT
-        if job.looked_after:
-            advice = "Look at the controller now. It is looked at again until the loop is as before. " + _UNTIL_SIGNED
+        if job.monitored:
+            advice = (
+                "Look at the controller now. It is looked at again until the loop is as before. " + _UNTIL_ACKNOWLEDGED
+            )
             if job.reason is not Reason.RESTORE_UNCONFIRMED:
                 advice = "Look at the controller now. It is looked at again until the loop is as before."
         else:
-            advice = "The loop was read back later, or a later test has begun on it. " + _UNTIL_SIGNED
+            advice = "The loop was read back later, or a later test has begun on it. " + _UNTIL_ACKNOWLEDGED
         yield Condition(
             alarm_id(AlarmKind.NOT_RESTORED, job.id), AlarmKind.NOT_RESTORED, job.loop, text, advice, job.host,
             job.loop, (job.loop,), f"/jobs/{job.id}", _seconds(job.at),
@@ -183,7 +185,9 @@ def _tests(known: AlarmFacts) -> Iterator[Condition]:
     for test in known.tests:
         if test.state not in _NO_ANSWER or test.id in unconfirmed:
             continue
-        if not known.signed.isdisjoint(_of_the_end(test.id)):  # whoever signed that has seen how the test ended
+        if not known.acknowledged.isdisjoint(
+            _of_the_end(test.id)
+        ):  # whoever acknowledged that has seen how the test ended
             continue
         how = "failed" if test.state is JobState.FAILED else "was interrupted"
         why = "" if test.reason is None else f": {str(test.reason).replace('_', ' ')}"
@@ -219,21 +223,23 @@ def _watches(known: AlarmFacts) -> Iterator[Condition]:
         trouble, job = each.watch.trouble, f"/jobs/{each.job_id}"
         if trouble is None:
             kind, since_s = AlarmKind.MODEL_MISMATCH, None
-            text, advice = _mismatch(each.watch), "Roll the new gains back, or retune the loop. " + _UNTIL_SIGNED
+            text, advice = _mismatch(each.watch), "Roll the new gains back, or retune the loop. " + _UNTIL_ACKNOWLEDGED
         elif trouble.kind is TroubleKind.FALSE_PV:
             kind, since_s, text = AlarmKind.FALSE_PV, _seconds(trouble.at), f"PV is false. {trouble.text}"
             advice = (
                 "Look at the sensor and the loop now: it is in automatic on this PV unless you put it in manual. "
-                f"Nothing was written to it, and the watch puts no gains back. {_UNTIL_SIGNED}"
+                f"Nothing was written to it, and the watch puts no gains back. {_UNTIL_ACKNOWLEDGED}"
             )
-        elif trouble.put_back:
+        elif trouble.rolled_back:
             kind, since_s = AlarmKind.ROLLED_BACK, _seconds(trouble.at)
-            text = f"The old gains were put back by the watch: {trouble.text}"
-            advice = f"Look at the loop, and at what was found of the model, before it is retuned. {_UNTIL_SIGNED}"
+            text = f"The previous gains were put back by the watch: {trouble.text}"
+            advice = (
+                f"Look at the loop, and at what was found of the model, before it is retuned. {_UNTIL_ACKNOWLEDGED}"
+            )
         else:
             kind, since_s = AlarmKind.SUSPECT_GAINS, _seconds(trouble.at)
             text = trouble.text
-            advice = f"Look at the loop now, and roll the new gains back. {_why_not(trouble)} {_UNTIL_SIGNED}"
+            advice = f"Look at the loop now, and roll the new gains back. {_why_not(trouble)} {_UNTIL_ACKNOWLEDGED}"
         yield Condition(
             alarm_id(kind, each.job_id), kind, each.loop, text, advice, each.host, each.loop, (each.loop,), job, since_s
         )
@@ -246,7 +252,7 @@ def _mismatch(watch: AcceptanceWatch) -> str:
 
 
 def _why_not(trouble: Trouble) -> str:
-    return "" if trouble.why_not is None else f"They were not put back by the watch: {trouble.why_not}."
+    return "" if trouble.reason is None else f"They were not put back by the watch: {trouble.reason}."
 
 
 def _gateways(known: AlarmFacts) -> Iterator[Condition]:
@@ -254,7 +260,7 @@ def _gateways(known: AlarmFacts) -> Iterator[Condition]:
         if gateway.silent:
             waited_from_s = max(gateway.waited_from_s, gateway.last_s or 0.0)
             yield Condition(
-                alarm_id(AlarmKind.GATEWAY_SILENT, gateway.name), AlarmKind.GATEWAY_SILENT, f"gateway {gateway.name}",
+                alarm_id(AlarmKind.GATEWAY_OFFLINE, gateway.name), AlarmKind.GATEWAY_OFFLINE, f"gateway {gateway.name}",
                 f"Gateway {gateway.name} does not answer", _GATEWAY_ADVICE, gateway.name, loops=gateway.loops,
                 since_s=gateway.last_s, from_s=waited_from_s,
             )  # fmt: skip
@@ -267,7 +273,7 @@ def _buses(known: AlarmFacts) -> Iterator[Condition]:
         why = bus.why.replace(f"bus '{bus.url}' ", "it ", 1)
         text, advice = f"Bus {bus.url} is down: {why}", _BUS_ADVICE
         if bus.why.startswith("the listening process"):
-            text, advice = f"Bus {bus.url} is not heard: {bus.why}", _EAR_ADVICE
+            text, advice = f"No data of bus {bus.url}: {bus.why}", _EAR_ADVICE
         yield Condition(
             alarm_id(AlarmKind.BUS_DOWN, known.host, bus.url), AlarmKind.BUS_DOWN, bus.url, text, advice, known.host,
             loops=_tags(loop.config for loop in known.loops if loop.config.bus == bus.url),
@@ -327,7 +333,7 @@ def _no_data(host: str, loop: LoopFacts, up_s: float) -> Iterator[Condition]:
     advice = "Check power and cable of controller and plant I/O, and that both nodes are operational."
     if heard is None:
         patience_s = max(3.0, _NEVER_HEARD_OF_T95 * config.t95_s)
-        text = "No data since the bus is heard"
+        text = "No data since the bus is up"
         yield _condition(AlarmKind.NO_DATA, host, config, text, advice, since_s=up_s, from_s=up_s, on_s=patience_s)
     elif heard.silent:
         from_s = max(heard.at_s, up_s)
@@ -355,7 +361,7 @@ def _gains(host: str, loop: LoopFacts) -> Iterator[Condition]:
         alarm_id(AlarmKind.GAINS_DIFFER, loop.config.tag, accepted.job_id, repr(gains)), AlarmKind.GAINS_DIFFER,
         loop.config.tag,
         f"The gains differ from those accepted last: {_words(gains)} instead of {_words(accepted.gains)}",
-        "If they are meant to, sign this off. Else retune the loop, or put the accepted gains back.",
+        "If they are meant to, acknowledge this. Else retune the loop, or put the accepted gains back.",
         host, loop.config.tag, (loop.config.tag,), f"/jobs/{accepted.job_id}",
     )  # fmt: skip
 

@@ -58,7 +58,7 @@ class Delays:
             if course.alarm is None or now_s - course.gone_s >= RULES[course.condition.kind].off_s:
                 del self._courses[id_]
         alarms = [course.alarm for course in self._courses.values() if course.alarm is not None]
-        return sorted(alarms, key=lambda alarm: (alarm.level, alarm.subject, alarm.kind, alarm.id))
+        return sorted(alarms, key=lambda alarm: (alarm.priority, alarm.subject, alarm.kind, alarm.id))
 
 
 def _from_s(course: _Course) -> float:
@@ -79,7 +79,7 @@ def _since(course: _Course, now_s: float) -> str:
 def _alarm(found: Condition, since: str) -> Alarm:
     rule = RULES[found.kind]
     return Alarm(
-        id=found.id, level=rule.level, kind=found.kind, subject=found.subject, text=found.text, advice=found.advice,
-        since=since, host=found.host, loop=found.loop, loops=list(found.loops), job=found.job, to_sign=rule.to_sign,
-        signed_off=None,
+        id=found.id, priority=rule.priority, kind=found.kind, subject=found.subject, text=found.text,
+        advice=found.advice, since=since, gateway=found.host, loop=found.loop, loops=list(found.loops), job=found.job,
+        unacknowledged=rule.to_acknowledge, acknowledged=None,
     )  # fmt: skip

@@ -23,7 +23,7 @@ from loopwright.service.store import alarms, audit, gateways, watches
 from loopwright.service.store.alarms import FalsePvJob, UnconfirmedJob
 from loopwright.service.store.live_jobs import Acceptance, JobInBrief, acceptances, latest_tests
 from loopwright.service.store.store import Store
-from loopwright.service.store.watches import AbnormalWatch
+from loopwright.service.store.watches import WatchWithAlarm
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ class _Stored:
     tests: Mapping[str, JobInBrief] = field(default_factory=dict)
     unconfirmed: Sequence[UnconfirmedJob] = ()
     false_pvs: Sequence[FalsePvJob] = ()
-    watches: Sequence[AbnormalWatch] = ()
+    watches: Sequence[WatchWithAlarm] = ()
     accepted: Mapping[str, Acceptance] = field(default_factory=dict)
     audited: int | None = None
 
@@ -61,7 +61,7 @@ class FactSource:
         self._stored = _Stored()
         self._gateways: Sequence[GatewayFacts] = ()
         self._asked_from_s: float | None = None
-        self._signed: frozenset[str] = frozenset()
+        self._acknowledged: frozenset[str] = frozenset()
         self._up_s: dict[str, float] = {}
 
     def gather(self, now_s: float) -> AlarmFacts:
@@ -90,10 +90,10 @@ class FactSource:
             return known
         if not away:  # else one more question would wait as long as the first one
             try:
-                self._signed = alarms.signed_off(store, candidates)
+                self._acknowledged = alarms.acknowledged(store, candidates)
             except SQLAlchemyError as error:
                 _report(error)
-        return replace(known, signed=self._signed)
+        return replace(known, acknowledged=self._acknowledged)
 
     def _asked_gateways(self, now_s: float) -> list[GatewayFacts]:
         """Asks for the other gateways. Raises SQLAlchemyError."""
@@ -160,7 +160,7 @@ def _asked(store: Store, before: _Stored) -> _Stored:
         tests=latest_tests(store),
         unconfirmed=alarms.unconfirmed(store),
         false_pvs=alarms.false_pvs(store),
-        watches=watches.abnormal(store),
+        watches=watches.with_alarm(store),
         accepted=before.accepted if audited == before.audited else acceptances(store),
         audited=audited,
     )

@@ -15,7 +15,7 @@ _KNOWN_EVERYWHERE = frozenset(
         AlarmKind.ROLLED_BACK,
         AlarmKind.MODEL_MISMATCH,
         AlarmKind.TEST_FAILED,
-        AlarmKind.GATEWAY_SILENT,
+        AlarmKind.GATEWAY_OFFLINE,
     }
 )
 """Kinds that every gateway finds in the database by itself."""
@@ -23,7 +23,7 @@ _KNOWN_EVERYWHERE = frozenset(
 
 def only_known_here(alarms: Iterable[Alarm], host: str) -> list[Alarm]:
     """Returns the alarms that the gateway `host` alone can know, which it has to say to the others."""
-    return [alarm for alarm in alarms if alarm.host == host and alarm.kind not in _KNOWN_EVERYWHERE]
+    return [alarm for alarm in alarms if alarm.gateway == host and alarm.kind not in _KNOWN_EVERYWHERE]
 
 
 def merged(own: Iterable[Alarm], known: AlarmFacts) -> list[Alarm]:
@@ -31,10 +31,10 @@ def merged(own: Iterable[Alarm], known: AlarmFacts) -> list[Alarm]:
 
     What a gateway has said last stays until it counts as one that does not answer: from then on nothing is known.
     """
-    found = {alarm.id: alarm for alarm in own if alarm.id not in known.signed}
-    silent = {alarm.host for alarm in found.values() if alarm.kind is AlarmKind.GATEWAY_SILENT}
+    found = {alarm.id: alarm for alarm in own if alarm.id not in known.acknowledged}
+    silent = {alarm.gateway for alarm in found.values() if alarm.kind is AlarmKind.GATEWAY_OFFLINE}
     for gateway in known.gateways:
         for alarm in gateway.alarms:
-            if gateway.name not in silent and alarm.id not in known.signed:
+            if gateway.name not in silent and alarm.id not in known.acknowledged:
                 found.setdefault(alarm.id, alarm)
-    return sorted(found.values(), key=lambda alarm: (alarm.level, alarm.subject, alarm.kind, alarm.id))
+    return sorted(found.values(), key=lambda alarm: (alarm.priority, alarm.subject, alarm.kind, alarm.id))

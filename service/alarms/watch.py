@@ -1,4 +1,4 @@
-"""Looks once a second at what is abnormal, and takes sign-offs."""
+"""Looks once a second at what is abnormal, and takes acknowledgements."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 
-from loopwright.service.alarms.alarm import LEVELS, RULES, Alarm, AlarmKind, Level, SignOff
+from loopwright.service.alarms.alarm import PRIORITIES, RULES, Acknowledgement, Alarm, AlarmKind, Priority
 from loopwright.service.alarms.conditions import conditions
 from loopwright.service.alarms.delays import Delays
 from loopwright.service.alarms.facts import FactSource, GatewaysSeen
@@ -17,10 +17,10 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.repeated import Repeated
 from loopwright.service.listening.listening import Listening
 from loopwright.service.store import alarms as stored
-from loopwright.service.store.alarms import NOT_RESTORED, SignedOffAlready
+from loopwright.service.store.alarms import NOT_RESTORED, AlreadyAcknowledged
 from loopwright.service.store.clock import now
 from loopwright.service.store.false_pv import FALSE_PV
-from loopwright.service.store.tables import AlarmSignOffRow
+from loopwright.service.store.tables import AlarmAcknowledgementRow
 
 LOOK_S = 1.0
 """Wall time between two looks, s."""
@@ -85,66 +85,66 @@ class AlarmWatch:
             self.on_change()
         return found
 
-    def counts(self) -> dict[Level, int]:
-        """Returns how many alarms of each level this gateway has, as they were seen last; those of others are left out,
-        so that the sum over all gateways has each once."""
-        found = Counter(alarm.level for alarm in self.latest or () if alarm.host == self._store.host)
-        return {level: found[level] for level in LEVELS}
+    def counts(self) -> dict[Priority, int]:
+        """Returns how many alarms of each priority this gateway has, as they were seen last; those of others are left
+        out, so that the sum over all gateways has each once."""
+        found = Counter(alarm.priority for alarm in self.latest or () if alarm.gateway == self._store.host)
+        return {priority: found[priority] for priority in PRIORITIES}
 
     def only_known_here(self) -> list[Alarm]:
         """Returns the alarms, as they were seen last, of which the other gateways know only what this one says."""
         return only_known_here(self.latest or (), self._store.host)
 
     def find(self, alarm_id: str) -> Alarm:
-        """Returns an alarm, also one that was signed off. Raises NoSuchAlarm, SQLAlchemyError."""
+        """Returns an alarm, also one that was acknowledged. Raises NoSuchAlarm, SQLAlchemyError."""
         alarm = _of(self.look(FRESH_S), alarm_id)
         if alarm is not None:
             return alarm
         row = stored.find(self._store, alarm_id)
         if row is None:
             raise NoSuchAlarm(alarm_id)
-        return _signed(row)
+        return _acknowledged(row)
 
-    def sign_off(self, alarm_id: str, by: str) -> Alarm:
-        """Signs an alarm off: a person answers for it, and it ends. Raises NoSuchAlarm, Conflict (it may not be signed
-        off, or was already), SQLAlchemyError."""
+    def acknowledge(self, alarm_id: str, by: str) -> Alarm:
+        """Acknowledges an alarm: a person answers for it, and it ends. Raises NoSuchAlarm, Conflict (it ends by itself,
+        or was acknowledged already), SQLAlchemyError."""
         alarm = _of(self.look(), alarm_id)
         if alarm is None:
             row = stored.find(self._store, alarm_id)
             if row is None:
                 raise NoSuchAlarm(alarm_id)
-            raise Conflict(str(SignedOffAlready(row)))
-        if not alarm.to_sign:
+            raise Conflict(str(AlreadyAcknowledged(row)))
+        if not alarm.unacknowledged:
             raise Conflict(
-                f"an alarm of level {alarm.level} is not signed off: it goes by itself {RULES[alarm.kind].off_s:g} s "
-                f"after its cause has gone. {alarm.subject}: {alarm.text}"
+                f"an alarm of priority {alarm.priority} is not acknowledged: it goes by itself "
+                f"{RULES[alarm.kind].off_s:g} s after its cause has gone. {alarm.subject}: {alarm.text}"
             )
-        row = AlarmSignOffRow(
-            alarm_id=alarm.id, level=alarm.level, kind=alarm.kind.value, host=alarm.host, loop=alarm.loop,
+        row = AlarmAcknowledgementRow(
+            alarm_id=alarm.id, priority=alarm.priority, kind=alarm.kind.value, host=alarm.gateway, loop=alarm.loop,
             job_id=None if alarm.job is None else alarm.job.rpartition("/")[2],
             text=alarm.text, since=alarm.since, by=by, at=now(),
         )  # fmt: skip
         try:
-            stored.sign_off(self._store, row)
-        except SignedOffAlready as error:
+            stored.acknowledge(self._store, row)
+        except AlreadyAcknowledged as error:
             raise Conflict(str(error)) from error
         self.look()
-        return _signed(row)
+        return _acknowledged(row)
 
 
 def _of(alarms: Iterable[Alarm], alarm_id: str) -> Alarm | None:
     return next((alarm for alarm in alarms if alarm.id == alarm_id), None)
 
 
-def _signed(row: AlarmSignOffRow) -> Alarm:
+def _acknowledged(row: AlarmAcknowledgementRow) -> Alarm:
     loops = [] if row.loop is None else [row.loop]
     return Alarm(
-        id=row.alarm_id, level=_LEVELS[row.level], kind=AlarmKind(row.kind), subject=row.loop or row.host,
-        text=row.text, advice="Nothing is left to do: it was signed off.", since=row.since, host=row.host,
-        loop=row.loop, loops=loops, job=None if row.job_id is None else f"/jobs/{row.job_id}", to_sign=True,
-        signed_off=SignOff(by=row.by, at=row.at),
+        id=row.alarm_id, priority=_PRIORITIES[row.priority], kind=AlarmKind(row.kind), subject=row.loop or row.host,
+        text=row.text, advice="Nothing is left to do: it was acknowledged.", since=row.since, gateway=row.host,
+        loop=row.loop, loops=loops, job=None if row.job_id is None else f"/jobs/{row.job_id}", unacknowledged=False,
+        acknowledged=Acknowledgement(by=row.by, at=row.at),
     )  # fmt: skip
 
 
-_LEVELS: dict[int, Level] = {level: level for level in LEVELS}
+_PRIORITIES: dict[int, Priority] = {priority: priority for priority in PRIORITIES}
 assert (NOT_RESTORED, FALSE_PV) == (AlarmKind.NOT_RESTORED, AlarmKind.FALSE_PV)

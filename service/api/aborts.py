@@ -24,7 +24,7 @@ def stopping(jobs: Jobs, path: str) -> Iterator[None]:
     if what == "jobs":
         stopped, by = [name] if jobs.tell_to_stop(name) else [], signed(None)
     else:
-        stopped, by = jobs.tell_all_of(name), f"retune {name}"
+        stopped, by = jobs.tell_all_of(name), f"batch {name}"
     try:
         yield
     finally:
@@ -38,7 +38,8 @@ _DECISION = TypeAdapter(Decision)
 async def _said(request: Request) -> str:
     """Who aborts, as far as the body says so; it may be missing, anything, and of any content type."""
     try:
-        given = _DECISION.validate_python(strict_json.loads(await request.body()))
+        body = strict_json.loads(await request.body())
+        given = _DECISION.validate_python({"by": body.get("by")} if isinstance(body, dict) else body)
     except (strict_json.BadJson, ValidationError):
         return signed(None)
     return signed(given.by)

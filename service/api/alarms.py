@@ -1,4 +1,4 @@
-"""Routes for what is abnormal, and for signing it off."""
+"""Routes for what is abnormal, and for acknowledging it."""
 
 from __future__ import annotations
 
@@ -18,28 +18,26 @@ AlarmId = Annotated[str, Path(description="Id of the alarm", examples=["0f3ac2d9
 
 
 def install(app: FastAPI, watch: AlarmWatch) -> None:
-    """Adds GET /alarms, GET /alarms/{id} and POST /alarms/{id}/sign-off."""
+    """Adds GET /alarms, GET /alarms/{id} and POST /alarms/{id}/acknowledge."""
     router = new_router("alarms")
 
-    @router.get(
-        "/alarms", summary="What is abnormal now, the worst first", responses={**LINK, **problems.responses(422)}
-    )
+    @router.get("/alarms", summary="The active alarms, the worst first", responses={**LINK, **problems.responses(422)})
     def list_alarms(response: Response, limit: Limit = 1000, cursor: Position = None) -> list[Alarm]:
         return list(page_of(response, "/alarms", watch.look(FRESH_S), limit, cursor))
 
     @router.get(
-        "/alarms/{alarm_id}", summary="An alarm, also one that was signed off", responses=problems.responses(404)
+        "/alarms/{alarm_id}", summary="An alarm, also one that was acknowledged", responses=problems.responses(404)
     )
     def get_alarm(alarm_id: AlarmId) -> Alarm:
         return watch.find(alarm_id)
 
     @router.post(
-        "/alarms/{alarm_id}/sign-off",
-        summary="Sign an alarm off: a person answers for it, and it ends",
+        "/alarms/{alarm_id}/acknowledge",
+        summary="Acknowledge an alarm: a person answers for it, and it ends",
         responses=problems.responses(404, 409, 422),
     )
-    def sign_off_alarm(alarm_id: AlarmId, decision: Annotated[Decision | None, Body()] = None) -> Alarm:
-        return watch.sign_off(alarm_id, signed_by(decision))
+    def acknowledge_alarm(alarm_id: AlarmId, decision: Annotated[Decision | None, Body()] = None) -> Alarm:
+        return watch.acknowledge(alarm_id, signed_by(decision))
 
     add(app, router)
 

@@ -31,14 +31,14 @@ def signed_test(options: AnyRetune | None) -> AnyRetune:
     BadBody."""
     if options is None:
         raise BadBody(
-            'a retune needs a body: send Content-Type: application/json and {"requested_by": "YOUR NAME"}, with the '
+            'a retune needs a body: send Content-Type: application/json and {"by": "YOUR NAME"}, with the '
             'options if there are any; {"dry_run": true} rehearses it and needs no name'
         )
-    named = bool((options.requested_by or "").strip())
+    named = bool((options.by or "").strip())
     if not named and not options.dry_run and current.get().key_id is None:
         raise BadBody(
-            'a test of the loop is signed by a person, and no key names the caller: add "requested_by": "YOUR NAME"',
-            "requested_by",
+            'a test of the loop is signed by a person, and no key names the caller: add "by": "YOUR NAME"',
+            "by",
         )
     return options
 

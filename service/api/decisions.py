@@ -51,8 +51,8 @@ class DecisionView(BaseModel):
         "itself did it",
         examples=["gw-1"],
     )
-    gains_before: GainsView | None = Field(description="Gains in effect before an acceptance or a rollback")
-    gains_after: GainsView | None = Field(description="Gains in effect after an acceptance or a rollback")
+    previous_gains: GainsView | None = Field(description="Gains in effect before an acceptance or a rollback")
+    new_gains: GainsView | None = Field(description="Gains in effect after an acceptance or a rollback")
     error: str | None = Field(description="Why the decision failed; null: it did not")
 
 
@@ -105,11 +105,11 @@ def _view(row: AuditRow) -> DecisionView:
         what=_kind(row.what),
         loop=row.loop or "",
         job=f"/jobs/{row.subject}",
-        by=row.said_by,
-        key=row.who,
+        by=row.by,
+        key=row.key,
         gateway=row.gateway,
-        gains_before=_gains(row.before) if decided else None,
-        gains_after=_gains(row.after) if decided else None,
+        previous_gains=_gains(row.before) if decided else None,
+        new_gains=_gains(row.after) if decided else None,
         error=str(after["error"]) if "error" in after else None,
     )
 

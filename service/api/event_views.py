@@ -95,10 +95,10 @@ class DecisionBegunEvent(_Event):
     detail: str | None = None
 
 
-class DismissedEvent(_Event):
+class AcknowledgedEvent(_Event):
     """Somebody answers for a loop whose restoration is not confirmed."""
 
-    kind: Literal["dismissed"]
+    kind: Literal["acknowledged"]
     by: str = Field(examples=["operator A"])
 
 
@@ -126,7 +126,7 @@ class ProgressEvent(_Event):
 
 Stored = (
     StateEvent | StageStartedEvent | StageDoneEvent | NoteEvent | ResumedEvent | LoopFoundEvent | AbortRequestedEvent
-    | DecisionBegunEvent | DismissedEvent | SamplesDeletedEvent
+    | DecisionBegunEvent | AcknowledgedEvent | SamplesDeletedEvent
 )  # fmt: skip
 
 

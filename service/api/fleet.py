@@ -1,4 +1,4 @@
-"""Routes for the list of loops, the lists of jobs, and retunes of many loops."""
+"""Routes for the list of loops, the lists of jobs, and batches."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
 from loopwright.service.live.other_gateways import OtherGateways
 from loopwright.service.states.job_state import JobState
+from loopwright.service.store.batches import BatchOver, BatchState, NoSuchBatch, Part, StopReason
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.live_jobs import acceptances, latest_jobs
-from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver, RetuneState, StopReason
-from loopwright.service.store.tables import RetuneRow
+from loopwright.service.store.tables import BatchRow
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Reason
 
-RetuneId = Annotated[str, Path(description="Id of the retune", examples=["9d1b7c02aa45"])]
+BatchId = Annotated[str, Path(description="Id of the retune", examples=["9d1b7c02aa45"])]
 Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 LoopFilter = Literal["busy", "idle"] | JobState
 
 
 class RetuneLoopView(BaseModel):
-    """A loop in a retune of many loops."""
+    """A loop in a batch."""
 
     loop: str = Field(examples=["TIC-101"])
     state: str = Field(
@@ -49,18 +49,18 @@ class RetuneLoopView(BaseModel):
     detail: str | None = Field(description="The numbers behind the reason, or why there is no job")
 
 
-class RetuneSummary(BaseModel):
-    """A retune of many loops."""
+class BatchSummary(BaseModel):
+    """A batch."""
 
     id: str = Field(examples=["9d1b7c02aa45"])
-    url: str = Field(examples=["/retunes/9d1b7c02aa45"])
-    state: RetuneState = Field(
+    url: str = Field(examples=["/batches/9d1b7c02aa45"])
+    state: BatchState = Field(
         description="running; stopping: no more loops are begun, some jobs still run; done: every loop was begun or "
         "skipped; stopped: by failures or with the service; aborted: by an operator",
         examples=["running"],
     )
-    host: str = Field(description="Name of the service that runs the retune", examples=["local"])
-    requested_by: str = Field(examples=["night shift"])
+    gateway: str = Field(description="Name of the gateway that runs the retune", examples=["local"])
+    by: str = Field(examples=["night shift"])
     created_at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
     ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
     request: Mapping[str, object] = Field(description="The options of the request")
@@ -72,7 +72,7 @@ class RetuneSummary(BaseModel):
     detail: str | None = Field(description="The stop reason in words")
 
 
-class RetuneView(RetuneSummary):
+class BatchView(BatchSummary):
     loops: list[RetuneLoopView] = Field(description="In the order in which they are begun")
 
 
@@ -101,7 +101,7 @@ def install(
         "/loops",
         response_model=list[LoopView],
         tags=["loops"],
-        summary="The configured loops of every host, sorted by tag",
+        summary="The configured loops of every gateway, sorted by tag",
         responses={**LINK, **problems.responses(422)},
     )
     def list_loops(
@@ -170,50 +170,50 @@ def install(
         return listed(response, views(rows[:limit]))
 
     @router.post(
-        "/retunes",
-        tags=["retunes"],
+        "/batches",
+        tags=["batches"],
         summary="Retune many loops",
         status_code=202,
         responses=problems.responses(422, 503),
     )
-    def retune_loops(request: Request, response: Response, body: Annotated[FleetRequest, Body()]) -> RetuneView:
+    def retune_loops(request: Request, response: Response, body: Annotated[FleetRequest, Body()]) -> BatchView:
         signed_test(body)
         row = fleet.start(body)
-        response.headers["Location"] = str(request.url_for("get_retune", retune_id=row.id).path)
+        response.headers["Location"] = str(request.url_for("get_batch", batch_id=row.id).path)
         return _view(*fleet.get(row.id))
 
     @router.get(
-        "/retunes",
-        tags=["retunes"],
-        summary="The retunes of many loops, latest first",
+        "/batches",
+        tags=["batches"],
+        summary="The batches, latest first",
         responses={**LINK, **problems.responses(422)},
     )
-    def list_retunes(response: Response, limit: Limit = 20, cursor: Cursor = None) -> list[RetuneSummary]:
+    def list_batches(response: Response, limit: Limit = 20, cursor: Cursor = None) -> list[BatchSummary]:
         found = fleet.recent(limit + 1, cursor)
         if len(found) > limit:
-            more(response, "/retunes", found[limit - 1][0].number, limit=limit)
+            more(response, "/batches", found[limit - 1][0].number, limit=limit)
         return [_summary(row, parts) for row, parts in found[:limit]]
 
     @router.get(
-        "/retunes/{retune_id}",
-        tags=["retunes"],
-        summary="A retune of many loops and its progress",
+        "/batches/{batch_id}",
+        tags=["batches"],
+        summary="A batch and its progress",
         responses=problems.responses(404),
     )
-    def get_retune(retune_id: RetuneId) -> RetuneView:
-        return _view(*fleet.get(retune_id))
+    def get_batch(batch_id: BatchId) -> BatchView:
+        return _view(*fleet.get(batch_id))
 
     @router.post(
-        "/retunes/{retune_id}/abort",
-        tags=["retunes"],
-        summary="Stop a retune of many loops: no more loops are begun, running jobs stop, and their loops are restored",
+        "/batches/{batch_id}/abort",
+        tags=["batches"],
+        summary="Stop a batch: no more loops are begun, running jobs stop, and their loops are restored",
         status_code=202,
         responses=problems.responses(404, 409, 422),
         openapi_extra=BODY,
     )
-    def abort_retune(retune_id: RetuneId, by: SaidBy) -> RetuneView:
-        fleet.abort(retune_id, by)
-        return _view(*fleet.get(retune_id))
+    def abort_batch(batch_id: BatchId, by: SaidBy) -> BatchView:
+        fleet.abort(batch_id, by)
+        return _view(*fleet.get(batch_id))
 
     add(app, router)
 
@@ -221,12 +221,12 @@ def install(
     async def _bad(_request: Request, error: BadFleet) -> JSONResponse:
         return problems.problem(422, str(error), reason=Reason.BAD_INPUT)
 
-    @app.exception_handler(NoSuchRetune)
-    async def _unknown(_request: Request, error: NoSuchRetune) -> JSONResponse:
-        return problems.problem(404, str(error), reason=problems.ProblemReason.UNKNOWN_RETUNE)
+    @app.exception_handler(NoSuchBatch)
+    async def _unknown(_request: Request, error: NoSuchBatch) -> JSONResponse:
+        return problems.problem(404, str(error), reason=problems.ProblemReason.UNKNOWN_BATCH)
 
-    @app.exception_handler(RetuneOver)
-    async def _over(_request: Request, error: RetuneOver) -> JSONResponse:
+    @app.exception_handler(BatchOver)
+    async def _over(_request: Request, error: BatchOver) -> JSONResponse:
         return problems.problem(409, str(error), reason=problems.ProblemReason.WRONG_STATE)
 
 
@@ -238,14 +238,14 @@ def _is(wanted: LoopFilter | None, busy: bool, last: str | None) -> bool:
     return wanted == last
 
 
-def _summary(row: RetuneRow, parts: list[Part]) -> RetuneSummary:
+def _summary(row: BatchRow, parts: list[Part]) -> BatchSummary:
     may_begin = row.stop_reason is None
-    return RetuneSummary(
+    return BatchSummary(
         id=row.id,
-        url=f"/retunes/{row.id}",
-        state=RetuneState(row.state),
-        host=row.host,
-        requested_by=row.requested_by,
+        url=f"/batches/{row.id}",
+        state=BatchState(row.state),
+        gateway=row.host,
+        by=row.by,
         created_at=row.created_at,
         ended_at=row.ended_at,
         request=row.request,
@@ -256,7 +256,7 @@ def _summary(row: RetuneRow, parts: list[Part]) -> RetuneSummary:
     )
 
 
-def _view(row: RetuneRow, parts: list[Part]) -> RetuneView:
+def _view(row: BatchRow, parts: list[Part]) -> BatchView:
     may_begin = row.stop_reason is None
     loops = [
         RetuneLoopView(
@@ -268,4 +268,4 @@ def _view(row: RetuneRow, parts: list[Part]) -> RetuneView:
         )
         for part in parts
     ]
-    return RetuneView(**dict(_summary(row, parts)), loops=loops)
+    return BatchView(**dict(_summary(row, parts)), loops=loops)

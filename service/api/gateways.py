@@ -9,7 +9,7 @@ from fastapi import APIRouter, Response
 from pydantic import BaseModel, Field
 
 from loopwright.service.api import problems
-from loopwright.service.api.job_views import LastHeardView, LiveErrorView, LiveView
+from loopwright.service.api.job_views import LastDataView, LiveErrorView, LiveView
 from loopwright.service.api.paging import LINK, Limit, Position, page_of
 from loopwright.service.api.routes import new_router
 from loopwright.service.errors import GatewayLost
@@ -27,8 +27,8 @@ class GatewayBusView(BaseModel):
     """A bus of a gateway."""
 
     bus: str = Field(description="Address of the CAN bus", examples=["socketcan:can0"])
-    up: bool | None = Field(description="Whether it is heard; null: it is not listened to, or not known")
-    why: str | None = Field(description="Why it is not heard; null: it is")
+    up: bool | None = Field(description="Whether it is up; null: it is not listened to, or not known")
+    why: str | None = Field(description="Why there is no data of it; null: there is")
 
     @classmethod
     def of(cls, bus: BusView) -> GatewayBusView:
@@ -89,16 +89,16 @@ def live_there(config: LoopConfig, host: str, others: OtherGateways) -> tuple[Li
         ), None
     if why is not None:
         return None, LiveErrorView.of(GatewayLost(why))
-    down = any((bus.host, bus.bus, bus.up) == (host, config.bus, False) for bus in others.buses())
+    down = any((bus.gateway, bus.bus, bus.up) == (host, config.bus, False) for bus in others.buses())
     reason = Reason.BUS_LOST if down else Reason.NODE_LOST
-    detail = values.not_heard or "the controller has not been read yet"
+    detail = values.no_data or "the controller has not been read yet"
     return None, LiveErrorView.of(Failed(reason, f"gateway {host}: {detail}"))
 
 
-def last_heard(values: LoopValues) -> LastHeardView | None:
+def last_data(values: LoopValues) -> LastDataView | None:
     """Returns the values that were heard last; None: nothing was heard."""
     last = old(values)
-    return None if last is None else LastHeardView(**dict(last), age_s=values.age_s)
+    return None if last is None else LastDataView(**dict(last), age_s=values.age_s)
 
 
 def _here(own: OwnGateway, loops: int) -> GatewayView:
@@ -119,6 +119,6 @@ def _other(name: str, loops: int, others: OtherGateways) -> GatewayView:
         version=None if said is None else said.version,
         last_seen=None if said is None else stamp(datetime.fromtimestamp(said.at_s, UTC)),
         answers=others.answers(name),
-        buses=[GatewayBusView.of(bus) for bus in others.buses() if bus.host == name],
+        buses=[GatewayBusView.of(bus) for bus in others.buses() if bus.gateway == name],
         loops=loops,
     )

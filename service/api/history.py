@@ -78,8 +78,8 @@ class HistoryView(BaseModel):
         description="Times in which neighbours were under test: loops of the same area, and those whose outer_loop "
         "this loop is"
     )
-    not_heard: str | None = Field(
-        description="Why the loop is not heard at present; null: it is",
+    no_data: str | None = Field(
+        description="Why there is no data of the loop at present; null: there is",
         examples=["a bus of the kind slcan cannot be opened by a second process"],
     )
 
@@ -90,7 +90,7 @@ def router(directory: LoopDirectory, listening: Listening) -> APIRouter:
 
     @routes.get(
         "/loops/{tag}/history",
-        summary="PV, MV, set-point, mode and gains of a loop as heard on its bus, in normal operation and under test",
+        summary="PV, MV, set-point, mode and gains of a loop on its bus, in normal operation and under test",
         responses=problems.responses(404, 422, 503),
     )
     def get_history(
@@ -150,7 +150,7 @@ def _view(
         incomplete=(bins["gap"] > 0).tolist(),
         gaps=[GapView(from_s=round(begin, 3), to_s=round(end, 3)) for begin, end in found.rows.gaps],
         disturbed=[DisturbedView(from_s=round(a, 3), to_s=round(b, 3), loop=loop) for a, b, loop in disturbed],
-        not_heard=found.not_heard,
+        no_data=found.no_data,
     )
 
 

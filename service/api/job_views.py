@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
-from loopwright.service.api.watch_views import WatchView
+from loopwright.service.api.watch_views import MonitoringView
 from loopwright.service.inputs.config import Limits, LoopConfig, PermittedTest
+from loopwright.service.inputs.validation import STRICT
 from loopwright.service.jsonable import JsonObject, number
 from loopwright.service.results import (
     FIVE_STAGE,
@@ -30,7 +31,7 @@ from loopwright.service.results import (
 )
 from loopwright.service.security.principal import signed
 from loopwright.service.states.acceptance_watch import AcceptanceWatch
-from loopwright.service.states.job_state import ACTIVE, JobState, shown
+from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.states.loop_state import LoopState, gains_of, same_gains
 from loopwright.service.store.clock import stamp
 from loopwright.tuning.gains import Gains
@@ -38,7 +39,7 @@ from loopwright.tuning.reasons import ADVICE, Ended, Reason
 
 if TYPE_CHECKING:  # the command line reads views, and has no store
     from loopwright.service.jobs.active_job import Running
-    from loopwright.service.jobs.aftercare import NotHome
+    from loopwright.service.jobs.aftercare import UnconfirmedRestoration
     from loopwright.service.live.snapshot import JobProgress
     from loopwright.service.store.decision_requests import DecisionRequest
     from loopwright.service.store.jobs import Job, JobEvent
@@ -81,13 +82,13 @@ class AcceptedView(BaseModel):
     url: str = Field(description="URL of the job that proposed them", examples=["/jobs/4f0c2a9be113"])
     at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
     by: str = Field(description="Who accepted, as given in the request", examples=["operator A"])
-    ms: float | None = Field(description="Maximum sensitivity asked for; null: there is none", examples=[1.6])
+    Ms: float | None = Field(description="Maximum sensitivity asked for; null: there is none", examples=[1.6])
     gains: GainsView
 
     @classmethod
     def of(cls, found: Acceptance) -> AcceptedView:
         gains = GainsView.of(found.gains)
-        return cls(url=f"/jobs/{found.job_id}", at=found.at, by=found.by, ms=found.ms, gains=gains)
+        return cls(url=f"/jobs/{found.job_id}", at=found.at, by=found.by, Ms=found.Ms, gains=gains)
 
 
 class LiveErrorView(BaseModel):
@@ -128,7 +129,7 @@ class LoopView(BaseModel):
     test: PermittedTest = Field(description="What a test may do to the loop, from loops.yaml")
     area: str | None = Field(description="Area of the site, as named in loops.yaml", examples=["distillation"])
     notes: str = Field(description="Notes for the operator")
-    host: str = Field(description="Name of the service that is connected to the bus of the loop", examples=["local"])
+    gateway: str = Field(description="Name of the gateway that is connected to the bus of the loop", examples=["local"])
     active_job: str | None = Field(description="URL of the job that is using the loop", examples=["/jobs/4f0c2a9be113"])
     last_job_state: JobState | None = Field(description="State of the latest job of the loop; dry runs do not count")
     last_job: LastJobView | None = Field(description="The latest job; null: there is none")
@@ -157,15 +158,15 @@ class LiveView(BaseModel):
         description="operational, or the state of a node of the loop that is not operational",
         examples=["operational", "node 20h is pre-operational"],
     )
-    when_silent: str = Field(
+    fail_action: str = Field(
         description="What the plant's I/O does with MV when the controller fails; empty: not known",
         examples=["it holds MV where it is"],
     )
 
 
-class NotHomeView(BaseModel):
+class RestoreUnconfirmedView(BaseModel):
     """A loop whose restoration after a job is not confirmed. The service checks the loop until the restoration is
-    confirmed, or until `POST /loops/TAG/dismiss`."""
+    confirmed, or until `POST /loops/TAG/acknowledge`."""
 
     job: str = Field(description="URL of the job", examples=["/jobs/4f0c2a9be113"])
     reason: Reason | None = Field(description="Reason code from the closed list", examples=["node_not_operational"])
@@ -173,12 +174,12 @@ class NotHomeView(BaseModel):
     advice: str = Field(description="The detail, and what the operator should do")
 
     @classmethod
-    def of(cls, found: NotHome) -> NotHomeView:
+    def of(cls, found: UnconfirmedRestoration) -> RestoreUnconfirmedView:
         return cls(job=f"/jobs/{found.job_id}", reason=found.reason, detail=found.detail, advice=found.words)
 
 
-class LastHeardView(BaseModel):
-    """The values of a loop that were heard last."""
+class LastDataView(BaseModel):
+    """The last values of a loop."""
 
     pv: float | None = Field(description="Process value, PV units", examples=[49.8])
     sp: float | None = Field(description="Set-point, PV units", examples=[50.0])
@@ -194,11 +195,13 @@ class LoopDetail(LoopView):
         "were read within the last minute"
     )
     live_error: LiveErrorView | None = Field(description="Why the present state cannot be read; null: it is not so")
-    last_heard: LastHeardView | None = Field(
-        description="What was heard last of a loop whose present state is not known (`live` is null); of a loop of "
-        "another gateway, what that one has said last. null: the present state is known, or nothing was heard"
+    last_data: LastDataView | None = Field(
+        description="The last values of a loop whose present state is not known (`live` is null); of a loop of "
+        "another gateway, what that one has said last. null: the present state is known, or there was none"
     )
-    not_confirmed_home: NotHomeView | None = Field(description="The unconfirmed restoration; null: there is none")
+    restore_unconfirmed: RestoreUnconfirmedView | None = Field(
+        description="The unconfirmed restoration; null: there is none"
+    )
     not_acknowledged: str | None = Field(
         default=None,
         description="Which test has found PV to be false, and how that is acknowledged: until then no test begins; "
@@ -213,14 +216,14 @@ class LoopDetail(LoopView):
     knowledge: KnowledgeView | None = Field(
         description="What is known of the loop from its tests and from normal operation; null: nothing is"
     )
-    watch: WatchView | None = Field(
+    monitoring: MonitoringView | None = Field(
         default=None,
-        description="The watch of the loop since `accepted`; null: there is none",
+        description="The monitoring of the loop since `accepted`; null: there is none",
     )
 
 
-class DismissedView(BaseModel):
-    """The jobs whose unconfirmed restoration of a loop was dismissed, or whose finding of a false PV acknowledged."""
+class AcknowledgedView(BaseModel):
+    """The jobs for which somebody has taken over the loop: its restoration was not confirmed, or its PV false."""
 
     loop: str = Field(examples=["TIC-101"])
     jobs: list[str] = Field(
@@ -298,7 +301,8 @@ class JobLinks(BaseModel):
     designs: str | None = Field(description="Gains from robust to fast; null: there is no model")
     accept: str | None = Field(description="POST here accepts the proposal; null: there is none to accept")
     rollback: str | None = Field(
-        description="POST here declines the proposal, or puts the old gains back; null: there is nothing to put back"
+        description="POST here declines the proposal, or puts the previous gains back; null: there is nothing to put "
+        "back"
     )
     abort: str | None = Field(description="POST here stops the job; null: it is over")
 
@@ -337,12 +341,12 @@ class JobView(BaseModel):
         examples=["running"],
     )
     dry_run: bool
-    host: str = Field(description="Name of the service that runs the job", examples=["local"])
+    gateway: str = Field(description="Name of the gateway that runs the job", examples=["local"])
     attempts: int = Field(
         description="Number of starts of the job; more than 1 after a crash of the service", examples=[1]
     )
     request: Mapping[str, object] = Field(description="The options of the request")
-    requested_by: str = Field(examples=["night shift"])
+    by: str = Field(examples=["night shift"])
     created_at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
     started_at: str | None = Field(description="UTC, ISO 8601, wall time")
     ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
@@ -362,41 +366,46 @@ class JobView(BaseModel):
     plant_time_s: float = Field(description="Plant time so far, s", examples=[224.0])
     stages: list[StageView]
     method: str = Field(description="Method that computes the gains", examples=["fast"])
-    chosen: dict[str, float] = Field(description="Design parameters of the method in effect; the names carry the units")
+    design: dict[str, float] = Field(description="Design parameters of the method in effect; the names carry the units")
     ultimate: UltimateView | None
     model: ModelView | TransferModelView | None = Field(
         description="The process model, in the form of five-stage or of fast"
     )
-    old_gains: GainsView | None
+    previous_gains: GainsView | None
     new_gains: GainsView | None = Field(
         description="The gains proposed or rehearsed, or of a job with no_gain those found no better"
     )
     comparison: ComparisonView | None = Field(
-        description="Comparison of the present and the new gains on the model; null: there are no new gains, or the "
-        "job ran under an earlier version"
+        description="Comparison of the present and the new gains on the model; null: there are no new gains"
     )
     rehearsed_on: RehearsedOnView | None = Field(
         description="The plant and the gains of a dry run; null: the job is no dry run"
     )
     predicted: PredictedView | None = Field(description="Predicted performance of the new gains on the model")
-    predicted_before: PredictedView | None = Field(
-        description="Predicted performance of the old gains on the same model, only for method fast; null: the loop is "
-        "not stable with them. `comparison` has more figures, for every method"
+    predicted_previous: PredictedView | None = Field(
+        description="Predicted performance of the previous gains on the same model, only for method fast; null: the "
+        "loop is not stable with them. `comparison` has more figures, for every method"
     )
     model_from: str | None = Field(
-        description="Where the model of method fast or setpoint comes from, in words; null: there is none, or an "
-        "earlier version has found it",
+        description="Where the model of method fast or setpoint comes from, in words; null: there is none",
         examples=["pulses of the set-point, and the set-point step under the new gains"],
     )
     evidence: EvidenceView | None = Field(description="Evidence from the record of method fast, also for a refused job")
     verification: VerificationView | None = Field(description="Measured step that verifies the model of method fast")
-    tried: bool | None = Field(
-        description="Whether the new gains were tried on the loop by a set-point step; null: there are none, or of "
-        "a dry run",
+    tested_on_loop: bool | None = Field(
+        description="Whether the new gains were on the loop for a set-point step; null: there are none, or of a dry "
+        "run",
         examples=[True],
     )
-    before: StepView | None = Field(description="Measured set-point step with the old gains; only for five-stage")
-    after: StepView | None = Field(description="Measured set-point step with the new gains, from rest")
+    tested_b: float | None = Field(
+        description="Set-point weight b that was on the loop for that step, where it is not that of the new gains; "
+        "null: it is, or there was no step",
+        examples=[1.0],
+    )
+    step_before: StepView | None = Field(
+        description="Measured set-point step with the previous gains; only for five-stage"
+    )
+    step_after: StepView | None = Field(description="Measured set-point step with the new gains, from rest")
     notes: list[str]
     reason: Reason | None = Field(
         description="Why there is no proposal; reason code from the closed list", examples=["not_at_rest"]
@@ -414,10 +423,9 @@ class JobView(BaseModel):
         "this is no such proposal",
         examples=["/jobs/4f0c2a9be113"],
     )
-    watch: WatchView | None = Field(
+    monitoring: MonitoringView | None = Field(
         default=None,
-        description="The watch of the loop since the gains were accepted; null: they were not, or under an earlier "
-        "version",
+        description="The monitoring of the loop since the gains were accepted; null: they were not",
     )
     stopping: StoppingView | None = Field(description="The request to stop the job; null: there was none")
     sample_time_s: float | None = Field(
@@ -449,7 +457,7 @@ class SamplesView(BaseModel):
 class Decision(BaseModel):
     """The person who decides, for the audit trail."""
 
-    model_config = ConfigDict(strict=True)
+    model_config = STRICT
 
     by: str | None = Field(
         default=None, max_length=100, description="The default is the name of the key", examples=["operator A"]
@@ -457,12 +465,12 @@ class Decision(BaseModel):
 
 
 class AcceptDecision(Decision):
-    """The person who accepts, and what the watch of the loop may do."""
+    """The person who accepts, and what the monitoring of the loop may do."""
 
-    roll_back_by_itself: bool = Field(
+    auto_rollback: bool = Field(
         default=True,
-        description="Put the old gains back by itself if, while the loop is watched, PV leaves its limits or an "
-        "oscillation near the crossover grows over three periods, and nobody has changed gains or mode since",
+        description="Put the previous gains back automatically if, while the loop is monitored, PV leaves its limits "
+        "or an oscillation near the crossover grows over three periods, and nobody has changed gains or mode since",
     )
 
 
@@ -484,7 +492,7 @@ def loop_view(
     fields = config.model_dump(exclude={"noise_std_hint"})
     return LoopView(
         **fields,
-        host=host,
+        gateway=host,
         active_job=None if active is None else f"/jobs/{active}",
         last_job_state=None if last is None else last.state,
         last_job=None if last is None else LastJobView.of(last),
@@ -507,7 +515,7 @@ def live_view(state: LoopState) -> LiveView:
         sample_time_s=state.sample_time_s,
         reverse_acting=state.reverse_acting,
         node_state=state.node_state,
-        when_silent=state.when_silent,
+        fail_action=state.fail_action,
     )
 
 
@@ -527,11 +535,12 @@ def job_view(
     elsewhere: how far the job has come on the gateway that runs it, where that is another one and has said so.
     has_record: whether its samples are stored.  watch: of the loop since its gains were accepted.
     """
-    state = shown(row.state, row.dry_run)
+    state = row.state
     later = latest is not None and latest.id != row.id and state is JobState.PROPOSED
     method = str(row.request.get("method", FIVE_STAGE))
     kept = _record(state, events, has_record)
     result = row.result or empty_result(method)
+    verification = _verification(result, events)
     progress, remaining, wall, plant_time = _progress(state, row, events, running, elsewhere)
     return JobView(
         id=row.id,
@@ -540,10 +549,10 @@ def job_view(
         loop=row.loop,
         state=state,
         dry_run=row.dry_run,
-        host=row.host,
+        gateway=row.host,
         attempts=row.attempt,
         request=row.request,
-        requested_by=row.requested_by,
+        by=row.by,
         created_at=row.created_at,
         started_at=row.started_at,
         ended_at=row.ended_at,
@@ -554,21 +563,22 @@ def job_view(
         plant_time_s=plant_time,
         stages=_stages(events, row),
         method=method,
-        chosen=result.chosen,
+        design=result.design,
         ultimate=result.ultimate,
         model=result.model,
-        old_gains=GainsView.of(gains_of(row.old_gains)) if row.old_gains else result.old_gains,
+        previous_gains=GainsView.of(gains_of(row.previous_gains)) if row.previous_gains else result.previous_gains,
         new_gains=result.new_gains,
         comparison=result.comparison,
         rehearsed_on=result.rehearsed_on,
         predicted=result.predicted,
-        predicted_before=result.predicted_before if isinstance(result, FastResult) else None,
+        predicted_previous=result.predicted_previous if isinstance(result, FastResult) else None,
         model_from=result.model_from if isinstance(result, FastResult) else None,
         evidence=_evidence(result, events),
-        verification=_verification(result, events),
-        tried=_tried(result, row),
-        before=result.before if isinstance(result, FiveStageResult) else None,
-        after=result.after,
+        verification=verification,
+        tested_on_loop=_tested(result, row),
+        tested_b=_tested_b(result, verification),
+        step_before=result.step_before if isinstance(result, FiveStageResult) else None,
+        step_after=result.step_after,
         notes=[note for event in events if (note := event.note()) is not None] + result.notes,
         reason=row.reason,
         detail=row.detail,
@@ -577,7 +587,7 @@ def job_view(
         decided=_decided(events),
         decision_request=DecisionRequestView.of(request, row.state),
         superseded_by=f"/jobs/{latest.id}" if later and latest is not None else None,
-        watch=None if watch is None else WatchView.of(watch, row.state),
+        monitoring=None if watch is None else MonitoringView.of(watch, row.state),
         stopping=next((_stopping(event) for event in reversed(events) if event.kind == "abort_requested"), None),
         sample_time_s=None if row.found is None else number(row.found["sample_time_s"]),
         mode_found=None if row.found is None else str(row.found["mode"]),
@@ -639,10 +649,16 @@ def _verification(result: FastResult | FiveStageResult, events: Sequence[JobEven
     return None if found is None else VerificationView.of_stage(found)
 
 
-def _tried(result: FastResult | FiveStageResult, row: Job) -> bool | None:
+def _tested(result: FastResult | FiveStageResult, row: Job) -> bool | None:
     if result.new_gains is None or row.dry_run:
         return None
-    return result.after is not None or (isinstance(result, FastResult) and result.verification is not None)
+    return result.step_after is not None or (isinstance(result, FastResult) and result.verification is not None)
+
+
+def _tested_b(result: FastResult | FiveStageResult, verification: VerificationView | None) -> float | None:
+    if verification is None or result.new_gains is None or verification.b == result.new_gains.b:
+        return None
+    return verification.b
 
 
 def _stage_result(events: Sequence[JobEvent], stages: Sequence[str], field: str) -> JsonObject | None:

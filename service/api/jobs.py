@@ -147,12 +147,12 @@ def router(services: Services, shown: ShownJobs) -> APIRouter:
         job_id: JobId, response: Response, decision: Annotated[AcceptDecision | None, Body()] = None
     ) -> JobView:
         given = decision or AcceptDecision()
-        row = jobs.decisions.accept(job_id, signed_by(given), given.roll_back_by_itself)
+        row = jobs.decisions.accept(job_id, signed_by(given), given.auto_rollback)
         return decided(row, JobState.ACCEPTED, response)
 
     @routes.post(
         "/jobs/{job_id}/rollback",
-        summary="Decline the proposal, or write the old gains back after it was accepted",
+        summary="Decline the proposal, or write the previous gains back after it was accepted",
         responses={**_NOT_YET, **problems.responses(404, 409, 422, 503)},
     )
     def roll_back_job(

@@ -10,13 +10,13 @@ from fastapi import APIRouter, Body, Path, Request, Response
 from loopwright.service.api import gateways, problems
 from loopwright.service.api.bodies import signed_test
 from loopwright.service.api.job_views import (
+    AcknowledgedView,
     Decision,
-    DismissedView,
     JobView,
     LiveErrorView,
     LiveView,
     LoopDetail,
-    NotHomeView,
+    RestoreUnconfirmedView,
     live_view,
     loop_view,
     signed_by,
@@ -24,7 +24,7 @@ from loopwright.service.api.job_views import (
 from loopwright.service.api.routes import new_router
 from loopwright.service.api.services import Services
 from loopwright.service.api.shown_jobs import ShownJobs
-from loopwright.service.api.watch_views import WatchView
+from loopwright.service.api.watch_views import MonitoringView
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import RetuneRequest
 from loopwright.service.loops.shared_reading import SharedReading
@@ -56,7 +56,7 @@ def router(services: Services, readings: SharedReading[LoopState | None], shown:
     @routes.get("/loops/{tag}", summary="A loop and its present state", responses=problems.responses(404, 503))
     def get_loop(tag: Tag) -> LoopDetail:
         config, host = jobs.directory.owner(tag)
-        not_home = next(iter(jobs.aftercare.not_home(tag)), None)
+        unconfirmed = next(iter(jobs.aftercare.unconfirmed(tag)), None)
         elsewhere = host != jobs.store.host
         present, away = there(config, host) if elsewhere else here(tag)
         last = others.values(tag, host) if elsewhere else own.values(tag, time.time())
@@ -76,22 +76,22 @@ def router(services: Services, readings: SharedReading[LoopState | None], shown:
             **dict(listed),
             live=present,
             live_error=away,
-            last_heard=None if present is not None else gateways.last_heard(last),
-            not_confirmed_home=NotHomeView.of(not_home) if not_home else None,
+            last_data=None if present is not None else gateways.last_data(last),
+            restore_unconfirmed=RestoreUnconfirmedView.of(unconfirmed) if unconfirmed else None,
             not_acknowledged=jobs.aftercare.not_acknowledged(tag),
             disturbed_by=jobs.directory.disturbed_by(tag),
             knowledge=jobs.knowledge.of(tag, gains),
-            watch=None if watched is None else WatchView.of(watched, JobState.ACCEPTED),
+            monitoring=None if watched is None else MonitoringView.of(watched, JobState.ACCEPTED),
         )
 
     @routes.post(
-        "/loops/{tag}/dismiss",
+        "/loops/{tag}/acknowledge",
         summary="Take responsibility for a loop whose restoration is not confirmed, or whose PV was found to be false",
         responses=problems.responses(404, 409, 422),
     )
-    def dismiss_loop(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> DismissedView:
-        found = jobs.aftercare.dismiss(tag, signed_by(decision))
-        return DismissedView(loop=tag, jobs=[f"/jobs/{job_id}" for job_id in found])
+    def acknowledge_loop(tag: Tag, decision: Annotated[Decision | None, Body()] = None) -> AcknowledgedView:
+        found = jobs.aftercare.acknowledge(tag, signed_by(decision))
+        return AcknowledgedView(loop=tag, jobs=[f"/jobs/{job_id}" for job_id in found])
 
     @routes.post(
         "/loops/{tag}/retune",

@@ -39,7 +39,7 @@ def router(jobs: Jobs, readings: SharedReading[LoopState | None], listening: Lis
     async def get_observation(
         http: Request,
         tag: Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])],
-        ms: Annotated[
+        Ms: Annotated[
             float,
             Query(
                 ge=1.2, le=2.0, allow_inf_nan=False, examples=[1.4],
@@ -63,7 +63,7 @@ def router(jobs: Jobs, readings: SharedReading[LoopState | None], listening: Lis
             Query(description="Largest set-point weight b of the gains, as in a retune; at most that of loops.yaml"),
         ] = None,
     ) -> ObservationView:  # fmt: skip
-        spec = DesignSpec(ms, derivative, noise_gain=noise_gain, aim=aim, settling_s=settling_s, mv_peak=mv_peak)
+        spec = DesignSpec(Ms, derivative, noise_gain=noise_gain, aim=aim, settling_s=settling_s, mv_peak=mv_peak)
         asked = await run_in_threadpool(asked_of, tag, spec, setpoint_weight_max)
         found = await computed(pool, partial(observed, asked), http, lambda: jobs.stopping)
         return await run_in_threadpool(kept, found, asked)
@@ -79,7 +79,7 @@ def router(jobs: Jobs, readings: SharedReading[LoopState | None], listening: Lis
         spec = replace(spec, weights=weights_up_to(permitted_weight(config, setpoint_weight_max)))
         state = readings.of(tag)
         if state is None:
-            raise Conflict(f"loop {tag} belongs to the host {host}, which listens to it: ask there")
+            raise Conflict(f"loop {tag} belongs to gateway {host}, which listens to it: ask there")
         return question(listening, jobs.store, config, state, spec, jobs.directory.disturbers(tag))
 
     return routes

@@ -47,10 +47,10 @@ def install(app: FastAPI) -> None:
 _TAGS = {
     "loops": "Loops, their present state, their history, and the start of a retune",
     "jobs": "Retunes of one loop: what they found, and the decision on it",
-    "retunes": "Retunes of many loops",
+    "batches": "Retunes of many loops at once",
     "tunings": "Gains for a model, without a loop",
-    "alarms": "What is abnormal now",
-    "live": "Values as they are heard, as a stream",
+    "alarms": "The active alarms",
+    "live": "Values as they are received, as a stream",
     "webhooks": "What the service calls by itself when a job awaits a decision or has ended",
     "operations": "The service itself: health, changes, keys and sessions",
 }

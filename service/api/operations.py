@@ -20,7 +20,7 @@ from loopwright.service.api.docs_page import POLICY, page
 from loopwright.service.api.openapi_document import as_document
 from loopwright.service.api.paging import LINK, Cursor, Limit, more
 from loopwright.service.api.routes import add, new_router
-from loopwright.service.jobs.aftercare import NotHome
+from loopwright.service.jobs.aftercare import UnconfirmedRestoration
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.loops.bus_watch import BusWatch
 from loopwright.service.store import audit
@@ -63,7 +63,7 @@ class AuditView(BaseModel):
 
     number: int = Field(description="Sequence number; the latest change has the largest one", examples=[17])
     at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
-    who: str = Field(
+    key: str = Field(
         description="Name of the key; `local`: a request without a key from this machine; `cli:USER`: a command on "
         "this machine; `service`: the service itself",
         examples=["control room"],
@@ -75,15 +75,15 @@ class AuditView(BaseModel):
         "itself did it",
         examples=["gw-1"],
     )
-    said_by: str | None = Field(description="Name of the person, as given in the request", examples=["night shift"])
+    by: str | None = Field(description="Name of the person, as given in the request", examples=["night shift"])
     what: str = Field(
-        description="retune, abort, accept, rollback, accept_failed, rollback_failed, retune_many, retune_many_abort, "
-        "dismiss, alarm_sign_off, lock, unlock, samples_delete, clock_jump, restore, key_create, key_revoke, "
+        description="retune, abort, accept, rollback, accept_failed, rollback_failed, batch, batch_abort, "
+        "acknowledge, acknowledge_alarm, lock, unlock, samples_delete, clock_jump, restore, key_create, key_revoke, "
         "sign_in, sign_out, sign_in_refused",
         examples=["accept"],
     )
     subject: str = Field(
-        description="Id of the job, the key, the alarm or the retune of many loops, or the tag of the loop",
+        description="Id of the job, the key, the alarm or the batch, or the tag of the loop",
         examples=["4f0c2a9be113"],
     )
     loop: str | None = Field(examples=["TIC-101"])
@@ -142,16 +142,16 @@ def checks(jobs: Jobs) -> dict[str, Check]:
     return {"database": database, "engine": engine, **{f"bus {url}": BusWatch(url).check for url in urls}}
 
 
-def loops_looked_after(jobs: Jobs) -> dict[str, Check]:
+def loops_monitored(jobs: Jobs) -> dict[str, Check]:
     """A failing check for each loop of this host whose restoration is not confirmed, with the reason."""
 
-    def part(found: NotHome) -> Check:
+    def part(found: UnconfirmedRestoration) -> Check:
         def check() -> None:
             raise RuntimeError(found.words)
 
         return check
 
-    return {f"loop {found.loop}": part(found) for found in jobs.aftercare.not_home()}
+    return {f"loop {found.loop}": part(found) for found in jobs.aftercare.unconfirmed()}
 
 
 def install(
@@ -159,7 +159,7 @@ def install(
 ) -> None:
     """Adds the routes. parts: the checks of /readyz.  sdo_retries: SDO retries by bus."""
     router = new_router("operations")
-    readiness = Readiness(parts, lambda: loops_looked_after(jobs))
+    readiness = Readiness(parts, lambda: loops_monitored(jobs))
     counted = metrics.registry(jobs.directory.loops, jobs.store, sdo_retries, alarms.counts)
 
     @router.get("/healthz", summary="Whether the process is alive")

@@ -33,7 +33,7 @@ Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 
 
 def router(jobs: Jobs, fleet: Fleet, pool: Pool) -> APIRouter:
-    """A router with POST /loops/{tag}/retune/preview and POST /retunes/preview. pool: computes how far PV goes."""
+    """A router with POST /loops/{tag}/retune/preview and POST /batches/preview. pool: computes how far PV goes."""
     routes = new_router()
 
     @routes.post(
@@ -58,12 +58,12 @@ def router(jobs: Jobs, fleet: Fleet, pool: Pool) -> APIRouter:
         return preview(config, request, now, _last(jobs.store.last_models(tag).get(tag)), known, told)
 
     @routes.post(
-        "/retunes/preview",
-        tags=["retunes"],
-        summary="Preview a retune of many loops from configuration and earlier jobs, without reading the controllers",
+        "/batches/preview",
+        tags=["batches"],
+        summary="Preview a batch from configuration and earlier jobs, without reading the controllers",
         responses=problems.responses(422, 503),
     )
-    def preview_retunes(request: Annotated[FleetRequest, Body()]) -> FleetPreview:
+    def preview_batch(request: Annotated[FleetRequest, Body()]) -> FleetPreview:
         options, busy, models = request.each(), jobs.store.busy(), jobs.store.last_models()
         locked, false = _locked(jobs), _not_acknowledged(jobs)
         return fleet_preview([

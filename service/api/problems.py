@@ -48,7 +48,7 @@ class ProblemReason(StrEnum):
     NOT_FOUND = "not_found"
     UNKNOWN_LOOP = "unknown_loop"
     UNKNOWN_JOB = "unknown_job"
-    UNKNOWN_RETUNE = "unknown_retune"
+    UNKNOWN_BATCH = "unknown_batch"
     UNKNOWN_ALARM = "unknown_alarm"
     METHOD_NOT_ALLOWED = "method_not_allowed"
     REQUEST_TIMEOUT = "request_timeout"

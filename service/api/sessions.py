@@ -46,7 +46,7 @@ class SessionView(BaseModel):
     name: str = Field(description="Name of the key; `local`: no keys are asked for", examples=["control room"])
     scope: Scope = Field(description="What the caller may do; each scope includes the one before", examples=["operate"])
     keys: bool = Field(description="Whether keys are asked for")
-    host: str = Field(description="Name of the service", examples=["local"])
+    gateway: str = Field(description="Name of the gateway that answers", examples=["local"])
     version: str = Field(description="Version of the service", examples=["0.1.0"])
     csrf: str | None = Field(
         default=None,
@@ -84,7 +84,7 @@ def router(store: Store, checks: KeyChecks | None, open_sessions: BrowserSession
 
     def view(who: Principal, csrf: str | None) -> SessionView:
         return SessionView(
-            name=who.name, scope=who.scope, keys=checks is not None, host=store.host, version=version("loopwright"),
+            name=who.name, scope=who.scope, keys=checks is not None, gateway=store.host, version=version("loopwright"),
             csrf=csrf,
         )  # fmt: skip
 

@@ -30,11 +30,11 @@ class SparklineView(BaseModel):
 
 
 class SparklinesView(BaseModel):
-    """The last minutes of all loops of this host, from memory alone."""
+    """The last minutes of all loops of this gateway, from memory alone."""
 
     from_s: float = Field(description="Begin, seconds since 1970 UTC", examples=[1769860530.5])
     to_s: float = Field(description="End: now, seconds since 1970 UTC", examples=[1769860830.5])
-    loops: list[SparklineView] = Field(description="Sorted by tag; a loop that is not heard has empty columns")
+    loops: list[SparklineView] = Field(description="Sorted by tag; a loop without data has empty columns")
 
 
 def router(directory: LoopDirectory, listening: Listening) -> APIRouter:

@@ -119,7 +119,7 @@ class TunedView(BaseModel):
     advice: str | None = Field(description="What to do about the refusal")
     gains: GainsView | None
     parallel: ParallelView | None
-    chosen: dict[str, float] | None = Field(description="Design parameters in effect; the names carry the units")
+    design: dict[str, float] | None = Field(description="Design parameters in effect; the names carry the units")
     notes: list[str]
     margins: MarginsView | None
     setpoint: FiguresView | None = Field(
@@ -167,10 +167,10 @@ class AlternativeView(TunedView):
     )
 
     uncertainty: float | None = Field(
-        description="Increase of Ms when the model is two standard deviations off, only with `ms`; null: no record"
+        description="Increase of Ms when the model is two standard deviations off, only with `Ms`; null: no record"
     )
     ambiguity: float | None = Field(
-        description="Largest difference of Ms on a candidate model that explains the record as well, only with `ms`; "
+        description="Largest difference of Ms on a candidate model that explains the record as well, only with `Ms`; "
         "null: no record"
     )
     curves: LoopCurves | None = Field(

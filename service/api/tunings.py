@@ -62,7 +62,7 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
             str | None,
             Query(description="Only this method; default: all but me-pso, which is slow", examples=["me-pso"]),
         ] = None,
-        ms: Annotated[
+        Ms: Annotated[
             float | None,
             Query(
                 ge=1.2, le=2.0, allow_inf_nan=False, examples=[1.4],
@@ -71,38 +71,38 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
         ] = None,
         derivative: Annotated[
             bool | None,
-            Query(description="Whether fast may design a PID; only with `ms`. The default is the option of the job"),
+            Query(description="Whether fast may design a PID; only with `Ms`. The default is the option of the job"),
         ] = None,
         aim: Annotated[
             Aim | None,
-            Query(description="What the gains are the best for; only with `ms`. The default is the option of the job"),
+            Query(description="What the gains are the best for; only with `Ms`. The default is the option of the job"),
         ] = None,
         settling_s: Annotated[
             Time | None,
             Query(
                 description="Longest settling time after a set-point step, s, as in a retune: the gains are those for "
-                "the smallest Ms up to `ms` that permits it; only with `ms`. The default is none, even where the job "
+                "the smallest Ms up to `Ms` that permits it; only with `Ms`. The default is none, even where the job "
                 "asked for one: it is another way to choose an Ms"
             ),
         ] = None,
         mv_peak: Annotated[
             Gain | None,
             Query(
-                description="Largest change of MV after a set-point step, percent per PV unit; only with `ms`. The "
+                description="Largest change of MV after a set-point step, percent per PV unit; only with `Ms`. The "
                 "default is the option of the job"
             ),
         ] = None,
         noise_gain: Annotated[
             Gain | None,
             Query(
-                description="Largest noise gain, percent per PV unit; only with `ms`. The default is the option of the "
+                description="Largest noise gain, percent per PV unit; only with `Ms`. The default is the option of the "
                 "job"
             ),
         ] = None,
         setpoint_weight_max: Annotated[
             SetpointWeight | None,
             Query(
-                description="Largest set-point weight b of the gains; only with `ms`. The default is the option of the "
+                description="Largest set-point weight b of the gains; only with `Ms`. The default is the option of the "
                 "job, else 1"
             ),
         ] = None,
@@ -112,25 +112,25 @@ def router(jobs: Jobs, pool: Pool) -> APIRouter:
             "noise_gain": noise_gain, "setpoint_weight_max": setpoint_weight_max,
         }  # fmt: skip
         for name, given in own.items():
-            if ms is None and given is not None:
-                raise tunings.BadTuning(f"{name} needs ms: give ms too")
-        if ms is not None and method not in (None, FAST):
-            raise tunings.BadTuning(f"ms is an option of fast, not of {method}: leave out ms or method")
+            if Ms is None and given is not None:
+                raise tunings.BadTuning(f"{name} needs Ms: give Ms too")
+        if Ms is not None and method not in (None, FAST):
+            raise tunings.BadTuning(f"Ms is an option of fast, not of {method}: leave out Ms or method")
         options: dict[str, Any] = {name: value for name, value in own.items() if value is not None}
         if "setpoint_weight_max" in options:
             options["weights"] = weights_up_to(options.pop("setpoint_weight_max"))
-        work = await run_in_threadpool(computation, job_id, method, ms, options)
+        work = await run_in_threadpool(computation, job_id, method, Ms, options)
         return AlternativesView.model_validate(await computed(pool, work, http, lambda: jobs.stopping))
 
     def computation(
-        job_id: str, method: str | None, ms: float | None, options: dict[str, Any]
+        job_id: str, method: str | None, Ms: float | None, options: dict[str, Any]
     ) -> Callable[[], Mapping[str, object]]:
         """The computation, with everything that it needs from the store."""
         row, events = jobs.store.get(job_id), jobs.store.events(job_id)
-        if ms is None:
+        if Ms is None:
             return partial(alternatives, row, events, method)
         fast = row.request.get("method") in DESIGNED  # other jobs are designed on the model that they found
         record = stored_record(record_columns(jobs.store.blocks(job_id))) if fast else None
-        return partial(redesigned, row, events, record, replace(asked_spec(row, ms), **options))
+        return partial(redesigned, row, events, record, replace(asked_spec(row, Ms), **options))
 
     return routes

@@ -1,4 +1,4 @@
-"""The view of the watch of a loop after gains were accepted."""
+"""The view of the monitoring of a loop after gains were accepted."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class InsteadView(BaseModel):
     """What fits operation instead of the model."""
 
     kind: DifferenceKind
-    words: str = Field(examples=["a second path acts 53.2 s later, with 43 +- 1.2 % of the gain of the model"])
+    message: str = Field(examples=["a second path acts 53.2 s later, with 43 +- 1.2 % of the gain of the model"])
     size: float = Field(
         description="gain: the gain over that of the model, less 1; second_path: its gain over that of the model; "
         "dead_time: by how much the dead time is longer, s",
@@ -38,7 +38,7 @@ class InsteadView(BaseModel):
     def of(cls, found: OtherPlant) -> InsteadView:
         return cls(
             kind=found.kind,
-            words=instead_in_words(found),
+            message=instead_in_words(found),
             size=found.size,
             deviation=found.deviation,
             delay_s=found.delay_s if found.kind is DifferenceKind.SECOND_PATH else None,
@@ -73,64 +73,68 @@ class WatchedChangeView(BaseModel):
 
 
 class WatchTroubleView(BaseModel):
-    """What went wrong while the loop was watched."""
+    """What went wrong while the loop was monitored."""
 
     kind: TroubleKind
     at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
     text: str = Field(examples=["PV went above its limit of 51 degC under the new gains"])
-    put_back: bool | None = Field(description="Whether the watch has put the old gains back; null: not decided yet")
-    why_not: str | None = Field(description="Why it has not; null: it has")
+    rolled_back: bool | None = Field(
+        description="Whether monitoring has put the previous gains back; null: not decided yet"
+    )
+    reason: str | None = Field(description="Why it has not; null: it has")
 
     @classmethod
     def of(cls, trouble: Trouble) -> WatchTroubleView:
         return cls(**trouble.model_dump())
 
 
-class WatchView(BaseModel):
-    """The watch of a loop since gains were accepted: operation compared with the model of the proposal, from what is
-    heard alone."""
+class MonitoringView(BaseModel):
+    """The monitoring of a loop after gains were accepted: operation compared with the model of the proposal, from
+    what is heard alone."""
 
     verdict: ModelState = Field(
         description="open: operation does not say yet; confirmed: at least one change confirms the model; mismatch: "
         "two changes at least show the same other plant"
     )
-    words: str = Field(examples=["The model is confirmed by 3 changes of normal operation."])
+    message: str = Field(examples=["The model is confirmed by 3 changes of normal operation."])
     since: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
-    going_on: bool = Field(description="Whether the loop is watched still")
-    end: WatchEnd | None = Field(description="Why the watch has ended; null: it goes on")
+    active: bool = Field(description="Whether the loop is still monitored")
+    end: WatchEnd | None = Field(description="Why monitoring has ended; null: it goes on")
     ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
-    not_heard: str | None = Field(
-        description="Why the loop is not heard at present; null: it is heard, or the watch has ended"
+    no_data: str | None = Field(
+        description="Why there is no data of the loop at present; null: there is, or monitoring has ended"
     )
-    wanted: int = Field(description="Changes that are compared, while the loop is watched", examples=[CHANGES])
+    requested: int = Field(description="Number of changes that are to be compared", examples=[CHANGES])
     confirmed: int = Field(description="Changes that confirm the model", examples=[3])
     changes: list[WatchedChangeView] = Field(description="The changes compared so far, oldest first")
     instead: InsteadView | None = Field(description="What fits instead, of a mismatch; null: there is none")
-    roll_back_by_itself: bool = Field(description="Whether the old gains are put back where something goes wrong")
-    disarmed: str | None = Field(description="Why they are not put back any more; null: they are, if asked for")
+    auto_rollback: bool = Field(description="Whether the previous gains are put back where something goes wrong")
+    auto_rollback_off: str | None = Field(
+        description="Why they are not put back any more; null: they are, if asked for"
+    )
     trouble: WatchTroubleView | None = Field(description="What went wrong; null: nothing")
     action: Literal["rollback"] | None = Field(
         description="What the operator may do about it: `POST /jobs/{id}/rollback`; null: nothing needs to be done"
     )
 
     @classmethod
-    def of(cls, watch: AcceptanceWatch, state: JobState) -> WatchView:
+    def of(cls, watch: AcceptanceWatch, state: JobState) -> MonitoringView:
         found = watch.conclusion()
         bad = found.state is ModelState.MISMATCH or watch.trouble is not None
         return cls(
             verdict=found.state,
-            words=watch.words,
+            message=watch.message,
             since=watch.since,
-            going_on=watch.end is None,
+            active=watch.end is None,
             end=watch.end,
             ended_at=watch.ended_at,
-            not_heard=watch.not_heard if watch.end is None else None,
-            wanted=CHANGES,
+            no_data=watch.no_data if watch.end is None else None,
+            requested=CHANGES,
             confirmed=found.confirmed,
             changes=[WatchedChangeView.of(each) for each in watch.changes],
             instead=None if found.instead is None else InsteadView.of(found.instead),
-            roll_back_by_itself=watch.roll_back_by_itself,
-            disarmed=watch.disarmed,
+            auto_rollback=watch.auto_rollback,
+            auto_rollback_off=watch.auto_rollback_off,
             trouble=None if watch.trouble is None else WatchTroubleView.of(watch.trouble),
             action="rollback" if bad and state is JobState.ACCEPTED else None,
         )

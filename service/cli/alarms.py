@@ -15,28 +15,28 @@ app = typer.Typer()
 
 @app.command()
 def alarms(
-    sign_off: Annotated[
+    acknowledge: Annotated[
         str | None,
-        typer.Option("--sign-off", metavar="ID", help="Sign this alarm off: you answer for it, and it ends."),
+        typer.Option("--acknowledge", metavar="ID", help="Acknowledge this alarm: you answer for it, and it ends."),
     ] = None,
     by: Annotated[
-        str | None, typer.Option(help="Name of the person who signs it off; default: the user logged in.")
+        str | None, typer.Option(help="Name of the person who acknowledges it; default: the user logged in.")
     ] = None,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
 ) -> None:
-    """Show what is abnormal, the worst first, or sign an alarm off."""
+    """Show the active alarms, the worst first, or acknowledge one."""
     from loopwright.service.alarms.alarm import Alarm
 
     client = Client(url)
-    if sign_off is not None:
-        answer = client.post(f"/alarms/{quote(sign_off, safe='')}/sign-off", {"by": by or user()})
+    if acknowledge is not None:
+        answer = client.post(f"/alarms/{quote(acknowledge, safe='')}/acknowledge", {"by": by or user()})
         if as_json:
             print_json(answer)
             return
-        signed = parsed(Alarm, answer)
-        if signed.signed_off is not None:
-            print(f"{signed.subject}: signed off by {signed.signed_off.by} at {signed.signed_off.at}: {signed.text}")
+        alarm = parsed(Alarm, answer)
+        if (done := alarm.acknowledged) is not None:
+            print(f"{alarm.subject}: acknowledged by {done.by} at {done.at}: {alarm.text}")
         return
     answer = client.get("/alarms")
     if as_json:
@@ -44,11 +44,14 @@ def alarms(
         return
     found = parsed(list[Alarm], answer)
     if not found:
-        print("Nothing is abnormal.")
+        print("No active alarms.")
         return
     from loopwright.service.cli import terminal
 
-    rows = ((each.level, each.subject, each.text, each.since, each.id if each.to_sign else "") for each in found)
-    terminal.rows("alarms", ("level", "of", "what", "since", "sign off with"), rows)
+    rows = (
+        (alarm.priority, alarm.subject, alarm.text, alarm.since, alarm.id if alarm.unacknowledged else "")
+        for alarm in found
+    )
+    terminal.rows("alarms", ("priority", "of", "what", "since", "acknowledge with"), rows)
     for advice in dict.fromkeys(f"{each.subject}: {each.advice}" for each in found):
         terminal.console.print(advice, highlight=False, soft_wrap=True)

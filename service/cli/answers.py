@@ -66,7 +66,7 @@ class UnlockAnswer(BaseModel):
 
 
 class FleetLoop(BaseModel):
-    """One loop of a retune of many loops."""
+    """One loop of a batch."""
 
     loop: str
     state: str
@@ -74,19 +74,19 @@ class FleetLoop(BaseModel):
     reason: str | None
 
 
-class FleetSummary(BaseModel):
-    """A retune of many loops, as GET /retunes returns it. counts: the number of loops in each state."""
+class BatchSummaryShown(BaseModel):
+    """A batch, as GET /batches returns it. counts: the number of loops in each state."""
 
     id: str
     url: str
     state: str
     detail: str | None
     counts: dict[str, int]
-    requested_by: str
+    by: str
     created_at: str
 
 
-class FleetRetune(FleetSummary):
-    """A retune of many loops, as GET /retunes/{id} returns it."""
+class BatchShown(BatchSummaryShown):
+    """A batch, as GET /batches/{id} returns it."""
 
     loops: list[FleetLoop]

@@ -65,7 +65,7 @@ def demonstrate(client: Client, tag: str, methods: Sequence[str]) -> Demonstrati
     for method in methods:
         path = f"/loops/{tag}/retune"
         terminal.console.print(f"POST       {client.url}{path}  method {method}", highlight=False)
-        begun = parsed(JobView, client.post(path, {"method": method, "requested_by": "demo"}))
+        begun = parsed(JobView, client.post(path, {"method": method, "by": "demo"}))
         jobs.append(job_tables.follow(client, begun.url, terminal.console))
     return Demonstration(jobs, time.monotonic() - started)
 
@@ -79,7 +79,7 @@ def report(client: Client, tag: str, shown: Demonstration, plant: TransferFuncti
     loop = _loop(client, tag)
     live = loop.live
     if live is None:
-        why = loop.not_confirmed_home.advice if loop.not_confirmed_home else "it belongs to another host"
+        why = loop.restore_unconfirmed.advice if loop.restore_unconfirmed else "it belongs to another gateway"
         why = f"{loop.live_error.detail}. {loop.live_error.advice}" if loop.live_error else why
         raise ApiError(f"the loop {tag} cannot be read: {why}")
     for job in shown.jobs:

@@ -1,4 +1,4 @@
-"""Shows a retune of many loops on a terminal."""
+"""Shows a batch on a terminal."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Mapping
 from datetime import datetime
 
-from loopwright.service.cli.answers import FleetRetune, FleetSummary
+from loopwright.service.cli.answers import BatchShown, BatchSummaryShown
 from loopwright.service.cli.client import Client, parsed
 from loopwright.service.cli.terminal import ago, console, rows
 
@@ -19,7 +19,7 @@ def follow(client: Client, url: str, quiet: bool = False) -> object:
     shown: dict[str, int] | None = None
     while True:
         answer = client.awaited(url)
-        found = parsed(FleetRetune, answer)
+        found = parsed(BatchShown, answer)
         if found.counts != shown and not quiet:
             shown = found.counts
             console.print(f"  {counted(shown)}", highlight=False)
@@ -33,15 +33,15 @@ def counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {state}" for state, count in counts.items())
 
 
-def summaries(found: Iterable[FleetSummary], now: datetime) -> None:
-    """Shows a table with a retune of many loops on each row. now: the present time."""
-    lines = ((x.id, x.state, counted(x.counts), x.requested_by, ago(x.created_at, now)) for x in found)
-    rows("retunes", ("id", "state", "loops", "by", "created"), lines, never_cut=("id", "created"))
+def summaries(found: Iterable[BatchSummaryShown], now: datetime) -> None:
+    """Shows a table with a batch on each row. now: the present time."""
+    lines = ((x.id, x.state, counted(x.counts), x.by, ago(x.created_at, now)) for x in found)
+    rows("batches", ("id", "state", "loops", "by", "created"), lines, never_cut=("id", "created"))
 
 
-def report(found: FleetRetune) -> None:
+def report(found: BatchShown) -> None:
     """Shows each loop with the state of its job."""
     loops = ((each.loop, each.state, each.job, each.reason) for each in found.loops)
-    rows(f"retune {found.id}: {found.state}", ("loop", "state", "job", "reason"), loops, never_cut=("job",))
+    rows(f"batch {found.id}: {found.state}", ("loop", "state", "job", "reason"), loops, never_cut=("job",))
     if found.detail:
         console.print(found.detail, highlight=False)

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from loopwright.service.api.job_views import JobView, LockView, LoopDetail
 from loopwright.service.api.report.words import stage_found, stage_name
-from loopwright.service.api.watch_views import WatchView
+from loopwright.service.api.watch_views import MonitoringView
 from loopwright.service.cli import terminal
 from loopwright.service.cli.answers import SHOWN_EVENTS, NoteShown, ProgressShown, StageDoneShown, StateShown
 from loopwright.service.cli.client import Client, parsed
@@ -75,15 +75,15 @@ def job_report(job: JobView, pv_unit: str = "PV unit") -> None:
         _say(title(job))
     if job.reason:
         _say(f"{job.reason}: {job.detail}\n{job.advice}")
-    heading_new = {JobState.NO_GAIN: "designed", JobState.REHEARSED: "rehearsed"}.get(job.state, "after")
+    heading_new = {JobState.NO_GAIN: "designed", JobState.REHEARSED: "rehearsed"}.get(job.state, "new")
     result_table(ShownResult.model_validate(job), None if in_words else title(job), heading_new, pv_unit)
     if job.comparison and not job.reason:
         terminal.console.print(job.comparison.verdict, highlight=False)
     if on := job.rehearsed_on:
         text = f"Rehearsed on {on.plant_text}; {on.gains_text}. Nothing was tested on the loop."
         terminal.console.print(text, highlight=False)
-    if job.watch is not None:
-        for sentence in watch(job.watch):
+    if job.monitoring is not None:
+        for sentence in monitoring(job.monitoring):
             _say(sentence)
     _show_next_steps(job)
 
@@ -91,12 +91,13 @@ def job_report(job: JobView, pv_unit: str = "PV unit") -> None:
 def decision_report(job: JobView, pv_unit: str = "PV unit") -> None:
     """Shows a job that was just decided about: the gains that the loop has now, and what can be done next."""
     _say(title(job))
-    gains = job.new_gains if job.state is JobState.ACCEPTED else job.old_gains
+    gains = job.new_gains if job.state is JobState.ACCEPTED else job.previous_gains
     if gains is not None:
         terms = [f"Kp {cell(gains.Kp)} % per {pv_unit}", f"Ti {cell(gains.Ti)} s"]
         terms += [f"Td {cell(gains.Td)} s"] if gains.Td else []
         terms += [f"b {cell(gains.b)}"] if gains.b != 1.0 else []
-        _say(f"{job.loop} has {', '.join(terms)}: {'the new' if job.state is JobState.ACCEPTED else 'its old'} gains")
+        which = "the new" if job.state is JobState.ACCEPTED else "its previous"
+        _say(f"{job.loop} has {', '.join(terms)}: {which} gains")
     _show_next_steps(job)
 
 
@@ -118,10 +119,10 @@ def next_steps(job: JobView) -> list[str]:
         case JobState.QUEUED | JobState.RUNNING:
             return [f"Follow it: {command} --follow", f"End it, with its loop restored: {command} --abort"]
         case JobState.PROPOSED if job.superseded_by is None:
-            accept, keep = f"Accept the new gains: {command} --accept", f"Keep the old gains: {command} --rollback"
+            accept, keep = f"Accept the new gains: {command} --accept", f"Keep the previous gains: {command} --rollback"
             return [accept, keep, plot, f"See other gains for the same model: loopwright alternatives {job.id}"]
         case JobState.ACCEPTED:
-            return [f"Take the old gains back: {command} --rollback"]
+            return [f"Put the previous gains back: {command} --rollback"]
         case JobState.REHEARSED:
             return [f"See what a test of the loop itself would do: loopwright retune {job.loop} --preview"]
     return [plot] if job.record == "kept" else []
@@ -158,7 +159,7 @@ def loop_report(loop: LoopDetail) -> None:
             for name, of in (("Kp", f"% per {unit}"), ("Ti", "s"), ("Td", "s"), ("b", ""))
         ),
         ("nodes", figure(live, "node_state"), ""),
-        ("host", loop.host, ""),
+        ("gateway", loop.gateway, ""),
         ("job", cell(job or (last and f"none; the last one: {last}")), ""),
         ("locked", cell(lock(loop.locked)), ""),
         ("disturbed by", cell(loop.disturbed_by), ""),
@@ -167,15 +168,15 @@ def loop_report(loop: LoopDetail) -> None:
     terminal.console.print(table)
     for sentence in knowledge(loop):
         terminal.console.print(sentence, highlight=False, soft_wrap=True)
-    if loop.watch is not None:
-        for sentence in watch(loop.watch):
+    if loop.monitoring is not None:
+        for sentence in monitoring(loop.monitoring):
             terminal.console.print(sentence, highlight=False, soft_wrap=True)
     if loop.live_error:
         error = loop.live_error
         text = f"The loop cannot be read: {error.detail}. {error.advice}"
         terminal.console.print(text, highlight=False)
-    if loop.not_confirmed_home:
-        terminal.console.print(loop.not_confirmed_home.advice, highlight=False)
+    if loop.restore_unconfirmed:
+        terminal.console.print(loop.restore_unconfirmed.advice, highlight=False)
     if loop.not_acknowledged:
         terminal.console.print(loop.not_acknowledged, highlight=False, soft_wrap=True)
 
@@ -190,20 +191,20 @@ def knowledge(loop: LoopDetail) -> list[str]:
         sentences[0] = f"{sentences[0][:-1]}: {known.Ms:.3g}."
     if known.pv_range is not None:
         sentences.append(f"It holds for PV {known.pv_range.low:.5g} .. {known.pv_range.high:.5g} {loop.pv_unit}.")
-    if known.older_plant is not None:
-        sentences.append(f"Not used any more: {known.older_plant}.")
+    if known.superseded is not None:
+        sentences.append(f"Not used any more: {known.superseded}.")
     return sentences
 
 
-def watch(found: WatchView) -> list[str]:
-    """Returns what the watch after an acceptance has come to, in sentences."""
-    sentences = [found.words]
-    if found.going_on:
-        sentences.append(f"The loop is watched: {len(found.changes)} of {found.wanted} changes were compared.")
-        if found.disarmed is not None:
-            sentences.append(f"The old gains are not put back by itself: {found.disarmed}.")
-        elif not found.roll_back_by_itself:
-            sentences.append("The old gains are not put back by itself: that was not asked for.")
+def monitoring(found: MonitoringView) -> list[str]:
+    """Returns what the monitoring after an acceptance has come to, in sentences."""
+    sentences = [found.message]
+    if found.active:
+        sentences.append(f"The loop is monitored: {len(found.changes)} of {found.requested} changes were compared.")
+        if found.auto_rollback_off is not None:
+            sentences.append(f"The previous gains are not put back automatically: {found.auto_rollback_off}.")
+        elif not found.auto_rollback:
+            sentences.append("The previous gains are not put back automatically: that was not asked for.")
     return sentences
 
 

@@ -1,4 +1,4 @@
-"""`loopwright jobs`, `loopwright retunes`, `loopwright job`, `loopwright report` and `loopwright alternatives`."""
+"""`loopwright jobs`, `loopwright batches`, `loopwright job`, `loopwright report` and `loopwright alternatives`."""
 
 from __future__ import annotations
 
@@ -105,19 +105,19 @@ def list_jobs(
     )
 
 
-@app.command("retunes")
-def list_retunes(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
-    """List the latest retunes of many loops."""
+@app.command("batches")
+def list_batches(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
+    """List the latest batches: batches."""
     from datetime import UTC, datetime
 
     from loopwright.service.cli import fleet_tables
-    from loopwright.service.cli.answers import FleetSummary
+    from loopwright.service.cli.answers import BatchSummaryShown
 
-    found = Client(url).get("/retunes")
+    found = Client(url).get("/batches")
     if as_json:
         print_json(found)
         return
-    fleet_tables.summaries(parsed(list[FleetSummary], found), datetime.now(UTC))
+    fleet_tables.summaries(parsed(list[BatchSummaryShown], found), datetime.now(UTC))
 
 
 @app.command("job")
@@ -128,15 +128,15 @@ def one_job(
     accept: Annotated[
         bool, typer.Option("--accept", help="Accept the proposal: write its gains to the controller.")
     ] = False,
-    roll_back_by_itself: Annotated[
+    auto_rollback: Annotated[
         bool,
         typer.Option(
-            help="With --accept: have the old gains put back while the loop is watched, if PV leaves its limits or an "
-            "oscillation grows."
+            help="With --accept: have the previous gains put back while the loop is watched, if PV leaves its limits "
+            "or an oscillation grows."
         ),
     ] = True,
     rollback: Annotated[
-        bool, typer.Option("--rollback", help="Decline the proposal, or restore the old gains.")
+        bool, typer.Option("--rollback", help="Decline the proposal, or restore the previous gains.")
     ] = False,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a plot of the job: .png, .svg or .pdf.")
@@ -160,9 +160,9 @@ def one_job(
         takes = f"at least {_SURE} characters of an id" if short else "an id"
         which = f"{job_id} begins that of" if short else "the last job is"
         die(f"--{decisions[0]} writes to a loop and takes {takes}: {which} {found.id}, of {found.loop}", 2)
-    if not accept and not roll_back_by_itself:
-        die("--no-roll-back-by-itself is for --accept", 2)
-    given: dict[str, object] = {"by": "cli"} | ({"roll_back_by_itself": roll_back_by_itself} if accept else {})
+    if not accept and not auto_rollback:
+        die("--no-auto-rollback is for --accept", 2)
+    given: dict[str, object] = {"by": "cli"} | ({"auto_rollback": auto_rollback} if accept else {})
     job = parsed(JobView, client.post(f"{path}/{decisions[0]}", given) if decisions else client.get(path))
     if follow:
         with job_going_on(job.id):
@@ -235,7 +235,7 @@ def alternatives_of_job(
     wanted = None if derivative is None else str(derivative).lower()
     client = Client(url)
     found = client.computed(
-        f"{path_of(client, job_id)}/alternatives", ms=ms, derivative=wanted, aim=aim, settling_s=settling_s,
+        f"{path_of(client, job_id)}/alternatives", Ms=ms, derivative=wanted, aim=aim, settling_s=settling_s,
         mv_peak=mv_peak, noise_gain=noise_gain, setpoint_weight_max=setpoint_weight_max, method=method,
     )  # fmt: skip
     if as_json:

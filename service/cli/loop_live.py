@@ -69,8 +69,8 @@ def line(seen: SeenLoop, unit: str) -> str:
     """Returns a loop as one line."""
     row = seen.row
     values = f"SP {_number(row.sp)} {unit}, PV {_number(row.pv)} {unit}, MV {_number(row.mv)} %, {row.mode or 'mode ?'}"
-    if row.not_heard is not None:
-        values = f"not heard: {row.not_heard}"
+    if row.no_data is not None:
+        values = f"no data: {row.no_data}"
     return ", ".join([f"{_time(seen)}  {values}", *_job_words(seen)])
 
 
@@ -79,7 +79,7 @@ def _shown(seen: SeenLoop, unit: str) -> Group:
     table = Table("SP", "PV", "MV", "mode", "", title=f"{row.tag} at {_time(seen)} (Ctrl-C ends)", min_width=70)
     values = (f"{_number(row.sp)} {unit}", f"{_number(row.pv)} {unit}", f"{_number(row.mv)} %", row.mode or "?")
     table.add_row(*values, "\n".join(_job_words(seen)) or "no test")
-    return Group(table, *([Text(f"not heard: {row.not_heard}")] if row.not_heard else []))
+    return Group(table, *([Text(f"no data: {row.no_data}")] if row.no_data else []))
 
 
 def _job_words(seen: SeenLoop) -> list[str]:

@@ -61,7 +61,7 @@ def check(
 def probe(
     bus: Annotated[str, typer.Option(metavar="URL", help="socketcan:can0, socketcand:HOST:PORT, ...")],
     node: Annotated[
-        list[str] | None, typer.Option(help="A node to ask also where no heartbeat is heard; may be repeated.")
+        list[str] | None, typer.Option(help="A node to ask also that sends no heartbeat; may be repeated.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -98,7 +98,7 @@ def probe(
 def one_loop(
     tag: Tag,
     follow: Annotated[
-        bool, typer.Option("--follow", "-f", help="Show it as it is heard, about once a second, until Ctrl-C.")
+        bool, typer.Option("--follow", "-f", help="Show it live, about once a second, until Ctrl-C.")
     ] = False,
     url: Url = DEFAULT_URL,
     as_json: AsJson = False,
@@ -144,7 +144,7 @@ def observe(
 
     path = f"/loops/{quote(tag, safe='')}/observation"
     found = Client(url).computed(
-        path, ms=ms, derivative=str(derivative).lower(), aim=aim, settling_s=settling_s, mv_peak=mv_peak,
+        path, Ms=ms, derivative=str(derivative).lower(), aim=aim, settling_s=settling_s, mv_peak=mv_peak,
         noise_gain=noise_gain, setpoint_weight_max=setpoint_weight_max,
     )  # fmt: skip
     shown = parsed(ObservationView, found)

@@ -120,8 +120,9 @@ def serve(
         str | None,
         typer.Option(envvar="LOOPWRIGHT_DATABASE", help="postgresql://..., shared by several hosts; default: a file."),
     ] = None,
-    host: Annotated[
-        str | None, typer.Option(envvar="LOOPWRIGHT_HOST", help="Name of this host among those of a shared database.")
+    gateway: Annotated[
+        str | None,
+        typer.Option(envvar="LOOPWRIGHT_GATEWAY", help="Name of this gateway among those of a shared database."),
     ] = None,
     own_url: Annotated[
         str | None,
@@ -261,7 +262,7 @@ def serve(
     except (ValueError, ArgumentTypeError):
         die(f"--node must be a CANopen node id, 1 to 127 (0x01 to 0x7F), not {node!r}", 2)
     setup = Setup(
-        loops, data, bind, port, database, host, resume,
+        loops, data, bind, port, database, gateway, resume,
         node=own_node, auth=auth, limits=limits, log_format="json" if log_format == "json" else "text",
         keep=RetentionPolicy(keep_jobs, keep_days, keep_history_days), trusted_proxies=proxies, listen=listen,
         url=None if own_url is None else own_url.rstrip("/"),
@@ -331,9 +332,9 @@ def retune(
     excitations: Annotated[
         str | None, typer.Option(help="What fast moves the loop by, of what loops.yaml permits: setpoint,relay,manual.")
     ] = None,
-    careful: Annotated[
-        bool, typer.Option("--careful", help="Let the relay of fast switch at least six times.")
-    ] = False,
+    min_switches: Annotated[
+        int | None, typer.Option(help="Smallest number of switches of the relay of fast: 4, 6, 8 or 10.")
+    ] = None,
     verify: Annotated[bool, typer.Option(help="Make the set-point step under the new gains.")] = True,
     propose_anyway: Annotated[
         bool,
@@ -362,15 +363,15 @@ def retune(
     options: dict[str, object] = {
         "sp_deviation": sp_deviation, "mv_low": mv_low, "mv_high": mv_high, "dry_run": dry_run or None,
         "directions": directions, "sp_rate_max_per_s": sp_rate_max,
-        "method": method, "ms": ms, "derivative": derivative or None, "aim": aim, "settling_s": settling_s,
+        "method": method, "Ms": ms, "derivative": derivative or None, "aim": aim, "settling_s": settling_s,
         "mv_peak": mv_peak, "noise_gain": noise_gain, "setpoint_weight_max": setpoint_weight_max,
         "amplitude_pct": amplitude,
         "excitations": excitations.split(",") if excitations else None,
-        "careful": careful or None, "verify": None if verify else False, "propose_anyway": propose_anyway or None,
+        "min_switches": min_switches, "verify": None if verify else False, "propose_anyway": propose_anyway or None,
         "pattern": loop if many else None,
     }  # fmt: skip
-    body = {name: value for name, value in options.items() if value is not None} | {"requested_by": "cli"}
-    path = "/retunes" if many else f"/loops/{loop}/retune"
+    body = {name: value for name, value in options.items() if value is not None} | {"by": "cli"}
+    path = "/batches" if many else f"/loops/{loop}/retune"
     if from_job is not None:
         if many:
             die("--from takes one loop, not a pattern", 2)
@@ -406,7 +407,7 @@ def _other_gains(
 
     wanted = str(derivative).lower() if ms is not None else None
     path = f"{jobs.path_of(client, job)}/alternatives"
-    answer = client.computed(path, ms=ms, derivative=wanted, method=method, **options)
+    answer = client.computed(path, Ms=ms, derivative=wanted, method=method, **options)
     found = parsed(AlternativesView, answer)
     if found.loop != loop:
         die(f"job {found.job} is of loop {found.loop}, not of {loop}", 2)
@@ -460,18 +461,18 @@ def _one(client: Client, started: object, wait: bool, as_json: bool) -> int:
 
 
 def _many(client: Client, started: object, wait: bool, as_json: bool) -> int:
-    """Follows the retune of many loops that was started; returns the exit status."""
+    """Follows the batch that was started; returns the exit status."""
     from loopwright.service.cli import fleet_tables
-    from loopwright.service.cli.answers import FleetRetune
+    from loopwright.service.cli.answers import BatchShown
     from loopwright.service.states.job_state import GOOD
 
-    answer, found = started, parsed(FleetRetune, started)
+    answer, found = started, parsed(BatchShown, started)
     if wait:
-        print(f"retune {found.id} of {len(found.loops)} loops", file=sys.stderr)
+        print(f"batch {found.id} of {len(found.loops)} loops", file=sys.stderr)
         ends = f"end it with: POST {client.url}{found.url}/abort"
-        with going_on(f"retune {found.id}", f"see it with: loopwright retunes, its jobs with: loopwright jobs, {ends}"):
+        with going_on(f"batch {found.id}", f"see it with: loopwright batches, its jobs with: loopwright jobs, {ends}"):
             answer = fleet_tables.follow(client, found.url, quiet=as_json)
-        found = parsed(FleetRetune, answer)
+        found = parsed(BatchShown, answer)
     if as_json:
         print_json(answer)
     else:
@@ -480,22 +481,22 @@ def _many(client: Client, started: object, wait: bool, as_json: bool) -> int:
 
 
 @app.command()
-def dismiss(
+def acknowledge(
     loop: Annotated[str, typer.Argument(help="Tag of the loop.")], url: Url = DEFAULT_URL, as_json: AsJson = False
 ) -> None:
     """Answer for a loop whose restoration after a job was not confirmed, or whose PV a test has found to be false."""
-    from loopwright.service.api.job_views import DismissedView
+    from loopwright.service.api.job_views import AcknowledgedView
 
-    answer = Client(url).post(f"/loops/{loop}/dismiss", {"by": "cli"})
+    answer = Client(url).post(f"/loops/{loop}/acknowledge", {"by": "cli"})
     if as_json:
         print_json(answer)
         return
-    jobs = parsed(DismissedView, answer).jobs
+    jobs = parsed(AcknowledgedView, answer).jobs
     if jobs:
-        print(f"{loop}: you answer for it now. It is looked after for no test, and no false PV keeps a test from it.")
+        print(f"{loop}: you answer for it now. It is monitored for no test, and no false PV keeps a test from it.")
         print(f"Acknowledged: {', '.join(jobs)}")
     else:
-        print(f"{loop}: there was nothing to acknowledge. It was not looked after, and no test has found its PV false.")
+        print(f"{loop}: there was nothing to acknowledge. It was not monitored, and no test has found its PV false.")
 
 
 app.command("methods")(tuning.methods)

@@ -22,28 +22,30 @@ def show(found: ObservationView, console: Console) -> None:
         console.print(line, highlight=False, soft_wrap=True)
     table = gains_table(found.present, found.proposed, f"% per {found.pv_unit}")
     for label, name, unit in (("overshoot", "overshoot_pct", "%"), ("settling", "settling_s", "s")):
-        of_both = [None if each is None else getattr(each, name) for each in (found.predicted_before, found.predicted)]
+        of_both = [
+            None if each is None else getattr(each, name) for each in (found.predicted_previous, found.predicted)
+        ]
         table.add_row(label, *map(cell, of_both), unit)
     console.print(table)
-    if found.tried_text:
-        console.print(found.tried_text, highlight=False)
+    if found.tested_text:
+        console.print(found.tested_text, highlight=False)
         console.print("What `retune` stands for:", highlight=False)
         console.print(json.dumps(found.retune), highlight=False, soft_wrap=True)
 
 
 def _lines(found: ObservationView) -> list[str]:
-    heard = found.heard
+    heard = found.data
     lines = [f"{found.loop}: {found.known}; {found.detail}"]
     lines += [found.advice] if found.advice else []
     if heard.from_s is not None and heard.to_s is not None:
         lines.append(
-            f"Heard {heard.duration_s:.4g} s in automatic within {_time(heard.from_s)} .. {_time(heard.to_s)}, "
+            f"Data: {heard.duration_s:.4g} s in automatic within {_time(heard.from_s)} .. {_time(heard.to_s)}, "
             f"in samples of {heard.sample_s:.3g} s."
         )
     known = found.knowledge
     if known is not None and known.source is not FindingSource.OPERATION:
         lines.append(f"Known already: {known.text}, at {known.at}.")
-    lines += [f"Not heard at present: {heard.not_heard}"] if heard.not_heard else []
+    lines += [f"No data at present: {heard.no_data}"] if heard.no_data else []
     if heard.disturbed_by:
         lines.append(f"Left out: the times in which neighbours were under test ({', '.join(heard.disturbed_by)}).")
     for what, changes in (("used", found.changes_used), ("not used", found.changes_dropped)):

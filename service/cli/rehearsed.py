@@ -43,7 +43,7 @@ class RehearsedJob:
     detail: str | None
     advice: str | None
     model: ModelView | TransferModelView | None
-    old_gains: GainsView | None
+    previous_gains: GainsView | None
     new_gains: GainsView | None
     evidence: EvidenceView | None
     verification: VerificationView | None
@@ -63,7 +63,7 @@ def rehearsed_job(found: Rehearsal, method: str) -> RehearsedJob:
         detail=ended.detail if ended else None,
         advice=ended.advice if ended else None,
         model=result.model,
-        old_gains=result.old_gains,
+        previous_gains=result.previous_gains,
         new_gains=result.new_gains,
         evidence=fast.evidence if fast else None,
         verification=fast.verification if fast else None,

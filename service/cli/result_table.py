@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import hypot
 
 from pydantic import BaseModel, ConfigDict
 from rich.table import Table
@@ -31,8 +30,6 @@ _PREDICTED = (
 )
 """Figures of a job of an earlier version, which has no comparison."""
 _NOTHING = ("", "-")
-_LAG_ERROR_MAX = 0.1
-"""Standard error of the lag, as a part of it, up to which a model of first order is shown as K, T and L."""
 _MS_SHOWN = 0.001
 
 
@@ -41,16 +38,16 @@ class ShownResult(BaseModel):
 
     model_config = ConfigDict(from_attributes=True)
 
-    old_gains: GainsView | None = None
+    previous_gains: GainsView | None = None
     new_gains: GainsView | None = None
-    before: StepView | None = None
-    after: StepView | None = None
+    step_before: StepView | None = None
+    step_after: StepView | None = None
     comparison: ComparisonView | None = None
     predicted: PredictedView | None = None
-    predicted_before: PredictedView | None = None
+    predicted_previous: PredictedView | None = None
     model: ModelView | TransferModelView | None = None
     model_from: str | None = None
-    tried: bool | None = None
+    tested_on_loop: bool | None = None
     evidence: EvidenceView | None = None
     verification: VerificationView | None = None
     ultimate: UltimateView | None = None
@@ -65,7 +62,7 @@ def result_table(
     heading_new: what the new gains are called.
     """
     table = Table(title=title)
-    for heading in ("", "before", heading_new, "unit"):
+    for heading in ("", "previous", heading_new, "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
     for label, before, after, unit in _figures(shown, pv_unit, mv_unit):
         if before not in _NOTHING or after not in _NOTHING:
@@ -86,16 +83,16 @@ def _figures(job: ShownResult, pv_unit: str, mv_unit: str) -> Iterator[tuple[str
     per = f"{mv_unit} per {pv_unit}"
     if job.new_gains is not None:
         for name, unit in (("Kp", f"{per} (ISA)"), ("Ti", "s"), ("Td", "s")):
-            yield f"gain {name}", figure(job.old_gains, name), figure(job.new_gains, name), unit
-        if weighted(job.old_gains, job.new_gains):
-            yield "set-point weight b", figure(job.old_gains, "b"), figure(job.new_gains, "b"), ""
-    if job.before or job.after:
+            yield f"gain {name}", figure(job.previous_gains, name), figure(job.new_gains, name), unit
+        if weighted(job.previous_gains, job.new_gains):
+            yield "set-point weight b", figure(job.previous_gains, "b"), figure(job.new_gains, "b"), ""
+    if job.step_before or job.step_after:
         for label, name, unit in (
             ("measured IAE", "IAE", f"{pv_unit} s"),
             ("measured overshoot", "overshoot_pct", "%"),
             ("measured settling", "settling_s", "s"),
         ):
-            yield label, figure(job.before, name), figure(job.after, name), unit
+            yield label, figure(job.step_before, name), figure(job.step_after, name), unit
     for label, was, now, unit in _predicted(job, pv_unit, mv_unit):
         yield f"predicted {label}", was, now, unit
     for label, value, unit in (*_model(job.model, pv_unit, mv_unit), *_certainty(job, mv_unit)):
@@ -114,8 +111,8 @@ def _predicted(job: ShownResult, pv_unit: str, mv_unit: str) -> Iterator[tuple[s
     """Yields lines of the table: label, before, after, unit."""
     compared = job.comparison
     if compared is None:
-        earlier = job.predicted_before
-        for label, name, unit in _PREDICTED if earlier or not job.after else _MARGINS:
+        earlier = job.predicted_previous
+        for label, name, unit in _PREDICTED if earlier or not job.step_after else _MARGINS:
             yield label, "" if earlier is None else figure(earlier, name), figure(job.predicted, name), unit
         return
     for label, part, name, unit in (
@@ -136,46 +133,26 @@ def _predicted(job: ShownResult, pv_unit: str, mv_unit: str) -> Iterator[tuple[s
         elif name == "mv_peak":  # a row for who asked for it
             continue
         shown = []
-        for each in (compared.before, compared.after):
+        for each in (compared.previous, compared.new):
             of = getattr(each, part) if part else each
             shown.append(cell(getattr(of, name)) if each.stable else "unstable")
         yield label, shown[0], shown[1], unit
-    yield "J, the cost minimised", cell(compared.J_before), cell(compared.J_after), ""
+    yield "J, the cost minimised", cell(compared.J_previous), cell(compared.J_new), ""
 
 
 def _model(model: ModelView | TransferModelView | None, pv_unit: str, mv_unit: str) -> Iterator[tuple[str, str, str]]:
     """Yields lines of the table: label, value, unit."""
-    if model is None:
-        return
-    first_order = _first_order(model)
-    if first_order is not None:
-        for name, value, unit in zip("KTL", first_order, (f"{pv_unit} per {mv_unit}", "s", "s"), strict=True):
-            yield f"model {name}", value, unit
-    if first_order is not None or not isinstance(model, TransferModelView):
-        return
-    for label, coefficients, errors, unit in (
-        ("model num", model.num, model.num_errors, f"{pv_unit} per {mv_unit}"),
-        ("model den", model.den, model.den_errors, ""),
-    ):
-        known = errors or [0.0] * len(coefficients)
-        yield label, " ".join(map(_with_error, coefficients, known)), unit
-    yield "model dead time", _with_error(model.dead_time_s, model.dead_time_error_s), "s"
-
-
-def _first_order(model: ModelView | TransferModelView) -> tuple[str, ...] | None:
-    """Returns K, T and L of a model of first order whose lag the record determines; None for any other model."""
-    if not isinstance(model, TransferModelView):
-        return tuple(figure(model, name) for name in ("K", "T_s", "L_s"))
-    if len(model.num) != 1 or len(model.den) != 2 or model.den[1] <= 0.0:
-        return None
-    (b,), (_, a) = model.num, model.den
-    error = 0.0 if model.den_errors is None else model.den_errors[1] / a
-    if error > _LAG_ERROR_MAX:
-        return None
-    gain_error = 0.0 if model.num_errors is None else abs(model.num_errors[0] / b)
-    K, T = b / a, 1.0 / a
-    shown = (K, abs(K) * hypot(error, gain_error)), (T, T * error), (model.dead_time_s, model.dead_time_error_s)
-    return tuple(_with_error(*each) for each in shown)
+    if isinstance(model, ModelView):
+        for name, field, unit in (("K", "K", f"{pv_unit} per {mv_unit}"), ("T", "T_s", "s"), ("L", "L_s", "s")):
+            yield f"model {name}", figure(model, field), unit
+    elif model is not None:
+        for each in model.parameters:
+            unit = each.unit.replace("PV", pv_unit).replace("MV", mv_unit).replace("/", " per ")
+            yield f"model {each.name}", _with_error(each.value, each.error), unit
+        if not model.parameters:
+            yield "model num", " ".join(map(_with_error, model.num, model.num_errors or [0.0] * len(model.num))), ""
+            yield "model den", " ".join(map(_with_error, model.den, model.den_errors or [0.0] * len(model.den))), ""
+            yield "model dead time", _with_error(model.dead_time_s, model.dead_time_error_s), "s"
 
 
 def _with_error(value: float, error: float | None) -> str:
@@ -193,8 +170,8 @@ def _of_ms(difference: float | None) -> str:
 def _certainty(job: ShownResult, mv_unit: str) -> Iterator[tuple[str, str, str]]:
     """Yields lines of the table on how certain the result of fast is: label, value, unit."""
     found, step = job.evidence, job.verification
-    if job.tried is False:
-        yield "tried on the loop", "never", ""
+    if job.tested_on_loop is False:
+        yield "tested on the loop", "never", ""
     if found is not None:
         yield "uncertainty of Ms", _of_ms(found.uncertainty), "(2 std. dev.)"
         yield "Ms, other models", _of_ms(found.ambiguity), "(max. diff.)"

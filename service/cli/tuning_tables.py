@@ -146,17 +146,17 @@ def _refusals(refused: Sequence[TunedView]) -> None:
 
 
 def _parallel_form(each: TunedView) -> None:
-    chosen = ", ".join(f"{name} {short(value)}" for name, value in (each.chosen or {}).items())
+    design = ", ".join(f"{name} {short(value)}" for name, value in (each.design or {}).items())
     if each.parallel is not None:
         Kp, Ki, Kd = (short(value) for value in (each.parallel.Kp, each.parallel.Ki, each.parallel.Kd))
-        console.print(f"\nParallel form: Kp {Kp}, Ki {Ki} per s, Kd {Kd} s" + (f"\nChosen: {chosen}" if chosen else ""))
+        console.print(f"\nParallel form: Kp {Kp}, Ki {Ki} per s, Kd {Kd} s" + (f"\nDesign: {design}" if design else ""))
 
 
 def to_try(found: AlternativesView) -> None:
     """Shows how to try the gains on the loop, where there are gains of one method or for one Ms."""
     if len(found.methods) != 1 or not (body := found.methods[0].retune):
         return
-    ms = body.get("ms")
+    ms = body.get("Ms")
     wanted = f"--ms {ms:g}" if isinstance(ms, int | float) else f"--method {found.methods[0].method}"
     if body.get("derivative"):
         wanted += " --derivative"

@@ -346,7 +346,7 @@ def loop_of(plant: SimulatedProcess, facts: Facts, mode: Mode, setpoint: float =
     """A loop in memory on a process that rests at this MV."""
     span = 1e9
     settings = Settings(facts.mv_low, facts.mv_high, mv, pv_low=-span, pv_high=span, reverse=facts.reverse)
-    channel = Channel(facts.sample_time_s, settings, _parameters(facts.old_gains), setpoint, int(mode), mv)
+    channel = Channel(facts.sample_time_s, settings, _parameters(facts.previous_gains), setpoint, int(mode), mv)
     return RehearsedLoop(plant, channel, facts.sample_time_s)
 
 

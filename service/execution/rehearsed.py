@@ -108,7 +108,7 @@ class Rehearsal:
         """What a notebook shows: present and new gains, why there are none, and the record."""
         rows = [
             (name, f"{gains.Kp:.4g}", f"{gains.Ti:.4g}", f"{gains.Td:.4g}", f"{gains.b:.3g}")
-            for name, gains in (("present", self.result.old_gains), ("new", self.result.new_gains))
+            for name, gains in (("present", self.result.previous_gains), ("new", self.result.new_gains))
             if gains is not None
         ]
         notes = () if self.ended is None else (self.ended.advice,)

@@ -137,8 +137,8 @@ class _Run(Generic[T]):
         """Opens the session. From now on the loop has to be restored."""
         home = self._home = self._loop.begin(self._stop, self._note_session)
         self._on_home(home)
-        if home.when_silent:
-            self._on_event(Note(f"if the controller falls silent, the plant's I/O {home.when_silent}"))
+        if home.fail_action:
+            self._on_event(Note(f"if the controller fails, the plant's I/O {home.fail_action}"))
         return home
 
     def _pump(self, home: LoopState) -> None:

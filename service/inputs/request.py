@@ -40,7 +40,7 @@ from loopwright.tuning.experiments.step_limits import not_kept
 from loopwright.tuning.fast.design import MAX_WEIGHT, Aim
 from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.procedure import FAST, FastOptions
+from loopwright.tuning.fast.procedure import FAST, SWITCHES, FastOptions
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.setpoint_procedure import SETPOINT
 from loopwright.tuning.five_stage.procedure import PROCEDURE, Options, rule_of, stages_of
@@ -151,7 +151,7 @@ class _Retune(Bounds):
         "the loop, else on a guess; the job shows which",
     )
     plant: PlantModel | None = Field(default=None, description="Plant to rehearse on, only with dry_run")
-    requested_by: str | None = Field(
+    by: str | None = Field(
         default=None,
         max_length=100,
         description="Name of the person who requests the retune. The default is the name of the key; a test of the "
@@ -205,7 +205,7 @@ class DesignRetune(_Retune):
     """The options of the methods that fit a model to one record and design the gains on it."""
 
     method: str
-    ms: Annotated[float, Field(ge=1.2, le=2.0, allow_inf_nan=False)] = Field(
+    Ms: Annotated[float, Field(ge=1.2, le=2.0, allow_inf_nan=False)] = Field(
         default=1.6,
         description="Maximum sensitivity for which the gains are designed: 1.2 (robust) to 2.0 (fast)",
         examples=[1.4],
@@ -223,7 +223,7 @@ class DesignRetune(_Retune):
     settling_s: Time | None = Field(
         default=None,
         description="Longest time from a set-point step until PV stays within 5 % of it, on the model, s. The gains "
-        "are those for the smallest Ms that permits it, at most `ms`; where none does, the job ends as not_possible "
+        "are those for the smallest Ms that permits it, at most `Ms`; where none does, the job ends as not_possible "
         "and says what would",
         examples=[300.0],
     )
@@ -249,7 +249,7 @@ class DesignRetune(_Retune):
     def _design(self) -> dict[str, Any]:
         """The options of the design, as `DesignOptions` has them."""
         return {
-            "Ms": self.ms, "derivative": self.derivative, "aim": self.aim, "settling_s": self.settling_s,
+            "Ms": self.Ms, "derivative": self.derivative, "aim": self.aim, "settling_s": self.settling_s,
             "mv_peak": self.mv_peak, "noise_gain": self.noise_gain, "setpoint_weight_max": self.setpoint_weight_max,
             "verify": self.verify, "propose_anyway": self.propose_anyway,
         }  # fmt: skip
@@ -278,7 +278,7 @@ class FastRetune(DesignRetune):
         default="relay", description="First stage: relay, or design with a given model and without a relay test"
     )
     baseline: bool | None = Field(
-        default=None, description="Must be false or left out: fast records no set-point step with the old gains"
+        default=None, description="Must be false or left out: fast records no set-point step with the previous gains"
     )
     amplitude_pct: Positive | None = Field(
         default=None,
@@ -295,7 +295,12 @@ class FastRetune(DesignRetune):
         "else; in automatic it is left out",
         examples=[["setpoint"], ["observe", "setpoint"]],
     )
-    careful: bool = Field(default=False, description="Use at least six switches of the relay, not four")
+    min_switches: Literal[4, 6, 8, 10] | None = Field(
+        default=None,
+        description="Smallest number of switches of the relay after which its record is evaluated. The default is 4, "
+        "and 6 where no step verifies the gains",
+        examples=[6],
+    )
 
     _options: FastOptions = PrivateAttr()
 
@@ -320,7 +325,9 @@ class FastRetune(DesignRetune):
         if self.start == "relay" and self.model is not None and not self.dry_run:
             raise ValueError("model is for start=design, or for a dry run: the relay finds its own")
         try:
-            self._options = FastOptions(amplitude=self.amplitude_pct, careful=self.careful, **self._design())
+            self._options = FastOptions(
+                amplitude=self.amplitude_pct, min_switches=self.min_switches or SWITCHES[0], **self._design()
+            )
         except Refused as refused:
             raise ValueError(refused.detail) from refused
         return self
@@ -362,7 +369,7 @@ class FiveStages(_Retune):
         "overshoot_pct for estimate; model for optimise",
     )
     baseline: bool | None = Field(
-        default=None, description="Record a set-point step with the old gains; the default is true"
+        default=None, description="Record a set-point step with the previous gains; the default is true"
     )
     method_options: dict[str, bool | float | str] = Field(
         default_factory=dict,
@@ -461,7 +468,7 @@ class FiveStageRetune(FiveStages):
 
 def _named(value: object) -> object:
     if value == OBSERVE:
-        raise ValueError("observe starts no job: ask GET /loops/TAG/observation?ms=1.6 (loopwright observe TAG)")
+        raise ValueError("observe starts no job: ask GET /loops/TAG/observation?Ms=1.6 (loopwright observe TAG)")
     if not isinstance(value, str) or value not in METHODS:
         raise ValueError(f"method must be one of {FAST}, {SETPOINT}, {PROCEDURE}, {', '.join(METHODS)}, not {value!r}")
     return value
@@ -656,7 +663,7 @@ def _narrow_test(loop: LoopConfig, request: RetuneRequest) -> tuple[PermittedTes
     if more:
         words = f"loops.yaml permits {', '.join(permitted)} (test: excitations)"
         return loop.test, [f"excitations: {', '.join(more)} is asked for, {words}"]
-    of_relay = [name for name in ("amplitude_pct", "careful") if getattr(request, name)]
+    of_relay = [name for name in ("amplitude_pct", "min_switches") if getattr(request, name)]
     if of_relay and "relay" not in asked:
         return loop.test, [f"{', '.join(of_relay)}: of a relay, which is not among the excitations {', '.join(asked)}"]
     if asked == ("observe",) and not request.verify:

@@ -83,6 +83,13 @@ _MEANT = dict.fromkeys(("tau", "lag", "time_constant", "tc"), "T") | dict.fromke
     ("theta", "dead_time", "deadtime", "delay", "td", "dead"), "L"
 )
 """What models are called elsewhere."""
+RENAMED = {
+    "careful": "min_switches",
+    "requested_by": "by",
+    "roll_back_by_itself": "auto_rollback",
+    "said_by": "by",
+}
+"""What the field calls what had another name before 0.1.0, where the spelling is too far apart to be found."""
 
 
 def _shown(value: object) -> str:
@@ -95,6 +102,8 @@ def _shown(value: object) -> str:
 
 def did_you_mean(given: str, known: Sequence[str]) -> str:
     """Returns the question whether the most similar of the known names was meant; nothing where none is similar."""
+    if (renamed := RENAMED.get(given)) is not None and (not known or renamed in known):
+        return f"; did you mean {renamed}?"
     if (with_unit := f"{given}_s") in known:
         return f"; did you mean {with_unit}?"
     if (meant := _MEANT.get(given.lower().removesuffix("_s"))) is not None and f"{meant}_s" in known:

@@ -27,7 +27,7 @@ class Running:
     `stop_reason`.
 
     before_s: plant time of the earlier attempts, s; the time of this attempt is added to it.
-    retune: id of the retune of many loops that has begun the job; None: there is none.
+    retune: id of the batch that has begun the job; None: there is none.
     """
 
     def __init__(

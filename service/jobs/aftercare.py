@@ -15,7 +15,7 @@ from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.loops.restoration import Restoration, restore_loop_of
 from loopwright.service.states.loop_state import state_json
-from loopwright.service.store import false_pv, looked_after
+from loopwright.service.store import false_pv, unconfirmed_restorations
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
 from loopwright.service.telemetry.logs import about
@@ -33,7 +33,7 @@ _UNREACHED = (Reason.NODE_LOST, Reason.NODE_NOT_ANSWERING, Reason.BUS_LOST, Reas
 
 
 @dataclass(frozen=True)
-class NotHome:
+class UnconfirmedRestoration:
     """A loop that is not confirmed to be in its state before a job, with that job and the reason at the last
     reading."""
 
@@ -50,8 +50,9 @@ class NotHome:
         else:
             advice = "Look at the controller; it is looked at again by itself."
         return (
-            f"not confirmed home after job {self.job_id}: {self.detail.removeprefix('not confirmed: ')}. {advice} "
-            f"If it is as it should be, sign its alarm off (on a command line: loopwright dismiss {self.loop})"
+            f"not confirmed to be restored after job {self.job_id}: {self.detail.removeprefix('not confirmed: ')}. "
+            f"{advice} If it is as it should be, acknowledge its alarm (on a command line: "
+            f"loopwright acknowledge {self.loop})"
         )
 
 
@@ -101,38 +102,38 @@ class Aftercare:
             if self._thread.is_alive():
                 log.error("a supervised loop has not answered in %.0f s, the service ends", _STOP_S)
 
-    def not_home(self, loop: str | None = None) -> list[NotHome]:
+    def unconfirmed(self, loop: str | None = None) -> list[UnconfirmedRestoration]:
         """Returns this host's supervised loops, each once; with `loop`, that loop if it is supervised, on any host."""
-        by_loop: dict[str, NotHome] = {}
-        for row in looked_after.rows(self._store, loop):
+        by_loop: dict[str, UnconfirmedRestoration] = {}
+        for row in unconfirmed_restorations.rows(self._store, loop):
             by_loop.setdefault(row.loop, self._not_home(row))
         return list(by_loop.values())
 
-    def _not_home(self, row: Job) -> NotHome:
+    def _not_home(self, row: Job) -> UnconfirmedRestoration:
         again = self._again.get(row.id)
         if again is not None:
-            return NotHome(row.loop, row.id, again.restoration.reason, again.restoration.text)
+            return UnconfirmedRestoration(row.loop, row.id, again.restoration.reason, again.restoration.text)
         reason = row.reason
-        return NotHome(row.loop, row.id, reason, row.detail or "it was not read back")
+        return UnconfirmedRestoration(row.loop, row.id, reason, row.detail or "it was not read back")
 
     def not_acknowledged(self, tag: str) -> str | None:
         """Returns in words which test of the loop has found PV to be false, where nobody has acknowledged that."""
         with self._store.reading() as session:
             return next(map(false_pv.words, false_pv.not_acknowledged(session, tag)), None)
 
-    def dismiss(self, tag: str, by: str) -> list[str]:
+    def acknowledge(self, tag: str, by: str) -> list[str]:
         """Ends the supervision of a loop, for which an operator now answers, and acknowledges that its PV was false.
         Returns the jobs for which that was so, none when it was not. Raises UnknownLoop, Busy."""
-        if self.not_acknowledged(tag) is None and not looked_after.rows(self._store, tag):
+        if self.not_acknowledged(tag) is None and not unconfirmed_restorations.rows(self._store, tag):
             self._directory.owner(tag)
             return []
         if (busy := self._store.why_busy(tag)) is not None:
             raise busy
-        return looked_after.dismissed(self._store, tag, by)
+        return unconfirmed_restorations.acknowledged(self._store, tag, by)
 
     def check_due_loops(self) -> None:
         """Reads every loop whose time has come."""
-        rows = looked_after.rows(self._store)
+        rows = unconfirmed_restorations.rows(self._store)
         for gone in self._again.keys() - {row.id for row in rows}:
             del self._again[gone]
         now = self.clock()
@@ -158,7 +159,7 @@ class Aftercare:
             restoration = restore_loop_of(row, self._directory.loops, self._directory.open_loop)
         if restoration.state is None:
             self._not_yet(row, restoration)
-        elif looked_after.home_again(
+        elif unconfirmed_restorations.confirmed(
             self._store, row.id, state_json(restoration.state), restoration.text, restoration.held
         ):
             log.info("the loop is not supervised any more: %s", restoration.text)

@@ -101,7 +101,7 @@ def _curves(row: Job, sampled: Model, gains: Gains | None, Ts: float) -> JsonObj
 
 def options_of(spec: DesignSpec) -> dict[str, bool | float | str]:
     """Returns the options of a request for gains of this specification."""
-    return {"ms": spec.Ms, "derivative": spec.derivative, "aim": spec.aim, **spec.requirements}
+    return {"Ms": spec.Ms, "derivative": spec.derivative, "aim": spec.aim, **spec.requirements}
 
 
 def _tuned(best: OptimalGains, spec: DesignSpec, assessed: Assessment) -> MethodResult:
@@ -110,8 +110,8 @@ def _tuned(best: OptimalGains, spec: DesignSpec, assessed: Assessment) -> Method
 
 
 def asked_spec(row: Job, Ms: float) -> DesignSpec:
-    """Returns the specification that the job asked for, with another Ms; the defaults where a job of an older version
-    or of another method has asked for nothing. The settling time is left out: it is a way to choose an Ms."""
+    """Returns the specification that the job asked for, with another Ms; the defaults where a job of another method
+    has asked for nothing. The settling time is left out: it is a way to choose an Ms."""
 
     def number(name: str) -> float | None:
         value = row.request.get(name)
@@ -130,12 +130,12 @@ def new_gains(row: Job) -> Gains | None:
     return None if row.result is None or row.result.new_gains is None else row.result.new_gains.gains()
 
 
-def old_gains(row: Job) -> Gains | None:
+def previous_gains(row: Job) -> Gains | None:
     """Returns the gains before a job; of a rehearsal, which finds none on a loop, those of its result. None where
     neither is known."""
-    if row.old_gains:
-        return gains_of(row.old_gains)
-    return None if row.result is None or row.result.old_gains is None else row.result.old_gains.gains()
+    if row.previous_gains:
+        return gains_of(row.previous_gains)
+    return None if row.result is None or row.result.previous_gains is None else row.result.previous_gains.gains()
 
 
 def job_model(row: Job, events: Sequence[JobEvent]) -> FoundModel:

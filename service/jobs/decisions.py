@@ -12,7 +12,7 @@ from loopwright.service.jobs.passing_on import PassingOn
 from loopwright.service.loops.gain_change import ForeignGains, replace_accepted
 from loopwright.service.observing.accepted_operation import watched
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
-from loopwright.service.states.job_state import JobState, shown
+from loopwright.service.states.job_state import JobState
 from loopwright.service.states.loop_state import LoopState, gains_of, same_gains, state_json
 from loopwright.service.store import loop_locks, watches
 from loopwright.service.store.decision_requests import What
@@ -47,22 +47,22 @@ class Decisions:
         # By loop: an event that is set when a decision that writes to its controller has ended.
         self._writes: dict[str, threading.Event] = {}
 
-    def accept(self, job_id: str, by: str, roll_back_by_itself: bool = True) -> Job:
+    def accept(self, job_id: str, by: str, auto_rollback: bool = True) -> Job:
         """Makes the proposed gains the accepted ones of the controller, and reads them back. Returns the job. The loop
         is watched from then on.
 
-        roll_back_by_itself: whether the watch puts the old gains back where something goes wrong.
+        auto_rollback: whether the watch puts the previous gains back where something goes wrong.
         After an error the decision can be repeated, which completes it, or be rolled back. A job of another host whose
         gateway has not answered yet is returned as it is, not accepted.
         Raises IllegalMove, Busy, Conflict, and Failed or Refused as the loop does; of another host's also GatewayLost,
         NotKnown.
         """
-        return self._decide(job_id, JobState.ACCEPTED, by, roll_back_by_itself=roll_back_by_itself)
+        return self._decide(job_id, JobState.ACCEPTED, by, auto_rollback=auto_rollback)
 
     def rollback(self, job_id: str, by: str) -> Job:
-        """Declines a proposal (the loop has its old gains already), or takes back an accepted or begun change. Gains
-        that were changed by others since then stay: a proposal is declined, but an accepted change is not taken back
-        (Conflict)."""
+        """Declines a proposal (the loop has its previous gains already), or takes back an accepted or begun change.
+        Gains that were changed by others since then stay: a proposal is declined, but an accepted change is not taken
+        back (Conflict)."""
         return self._decide(job_id, JobState.ROLLED_BACK, by)
 
     def roll_back_accepted(self, job_id: str, by: str) -> Job:
@@ -88,13 +88,13 @@ class Decisions:
         wanted: JobState,
         by: str,
         objection: Callable[[LoopState], str | None] = lambda state: None,
-        roll_back_by_itself: bool = True,
+        auto_rollback: bool = True,
         rolled_back: WithJob = watches.rolled_back,
     ) -> Job:
         row = self.store.get(job_id)
         with self._directory.alone_with(row.loop):
             row = self.store.get(job_id)
-            now = shown(row.state, row.dry_run)
+            now = row.state
             self.store.check_move(job_id, wanted)
             if (busy := self.store.why_busy(row.loop)) is not None:
                 raise busy
@@ -104,10 +104,10 @@ class Decisions:
                 loop_locks.check(session, row.loop)
             config, host = self._directory.owner(row.loop)
             if host != self.store.host:  # only the service there can write to it
-                asked = roll_back_by_itself if wanted is JobState.ACCEPTED else None
+                asked = auto_rollback if wanted is JobState.ACCEPTED else None
                 self._passing_on.ask(host, _WHAT[wanted], row.loop, job_id, by, asked)
                 return self.store.get(job_id)
-            old, new = gains_of(row.old_gains), new_gains(row)
+            old, new = gains_of(row.previous_gains), new_gains(row)
             before, after = (old, new) if wanted is JobState.ACCEPTED else (new, old)
             begun = self.store.decision_begun(job_id)
             over = self._machine.event()
@@ -138,7 +138,7 @@ class Decisions:
             finally:
                 self._writes.pop(row.loop, None)
                 over.set()
-            also = rolled_back if wanted is JobState.ROLLED_BACK else watched(by, roll_back_by_itself, config)
+            also = rolled_back if wanted is JobState.ROLLED_BACK else watched(by, auto_rollback, config)
             decided = self.store.move(job_id, wanted, by=by, also=also, restored=state_json(state))
             if wanted is JobState.ACCEPTED:
                 self._knowledge.accepted(decided)

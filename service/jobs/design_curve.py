@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from pydantic import AliasChoices, Field
 
-from loopwright.service.jobs.alternatives import asked_spec, new_gains, old_gains
+from loopwright.service.jobs.alternatives import asked_spec, new_gains, previous_gains
 from loopwright.service.jsonable import json_object
 from loopwright.service.planning.curves import Horizons, LoopCurves, horizons, loop_curves
 from loopwright.service.results import Figures, GainsView, PerformanceView
@@ -76,15 +76,15 @@ class DesignCurve(Figures):
     sampling_delay_s: float = Field(
         description="Delay of the sampling, which the figures have beside the dead time, s", examples=[0.05]
     )
-    before: PerformanceView | None = Field(description="Performance of the gains before the job; null: not known")
-    after: PerformanceView | None = Field(description="Performance of the gains of the job; null: it has none")
-    before_curves: LoopCurves | None = Field(
+    previous: PerformanceView | None = Field(description="Performance of the gains before the job; null: not known")
+    new: PerformanceView | None = Field(description="Performance of the gains of the job; null: it has none")
+    previous_curves: LoopCurves | None = Field(
         default=None, description="Steps and Nyquist curve of the gains before; null: not known, or not stable"
     )
-    after_curves: LoopCurves | None = Field(
+    new_curves: LoopCurves | None = Field(
         default=None, description="Steps and Nyquist curve of the gains of the job; null: it has none"
     )
-    after_beside: str | None = Field(
+    new_beside: str | None = Field(
         default=None, description="How the gains of the job compare with those before, in a sentence; null: not known"
     )
     designs: list[DesignPoint] = Field(description="One entry for each Ms, in rising order")
@@ -104,7 +104,7 @@ class _Designing:
     gains: Callable[[float], Gains]
     uncertainty: Callable[[Gains], float | None]
     largest: float
-    before: PerformanceView | None = None
+    previous: PerformanceView | None = None
     ends: Horizons = (1.0, 1.0)
 
     def point(self, Ms: float) -> DesignPoint:
@@ -126,7 +126,7 @@ class _Designing:
         return PerformanceView.model_validate(found)
 
     def beside(self, after: PerformanceView | None) -> str | None:
-        return None if self.before is None or after is None or not after.stable else beside(self.before, after)
+        return None if self.previous is None or after is None or not after.stable else beside(self.previous, after)
 
     def curves(self, gains: Gains | None) -> LoopCurves | None:
         return None if gains is None else loop_curves(self.model, gains, self.ends, self.Ts)
@@ -146,10 +146,10 @@ def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> Desig
         Ts = loop_state(row.found).sample_time_s if row.found else 0.0
         designing = _on_model(model, Ts, spec)
         delay_s, words = 0.5 * Ts, "the job's model"
-    old, new = old_gains(row), new_gains(row)
+    old, new = previous_gains(row), new_gains(row)
     before, after = (None if each is None else designing.performance(each) for each in (old, new))
     ends = horizons(designing.model, (new, old), designing.Ts)
-    designing = replace(designing, before=before, ends=ends)
+    designing = replace(designing, previous=before, ends=ends)
     if evaluation is not None and evaluation.reason is not None:
         refusal = Refused(evaluation.reason, evaluation.detail)
         points = [_refused(Ms, refusal) for Ms in GRID]
@@ -166,11 +166,11 @@ def design_curve(row: Job, model: Model, evaluation: Evaluation | None) -> Desig
         den=list(model.den),
         dead_time_s=model.L,
         sampling_delay_s=delay_s,
-        before=before,
-        after=after,
-        before_curves=designing.curves(old),
-        after_curves=designing.curves(new),
-        after_beside=designing.beside(after),
+        previous=before,
+        new=after,
+        previous_curves=designing.curves(old),
+        new_curves=designing.curves(new),
+        new_beside=designing.beside(after),
         designs=points,
     )
 

@@ -36,13 +36,13 @@ from loopwright.service.jobs.journal import temporary
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.security.principal import signed
 from loopwright.service.states.job_state import IllegalMove
-from loopwright.service.store import retunes
+from loopwright.service.store import batches
+from loopwright.service.store.batches import BatchOver, Part, StopReason
 from loopwright.service.store.clock import now
 from loopwright.service.store.journal_writes import as_asked
 from loopwright.service.store.lock import FolderInUse
-from loopwright.service.store.retunes import Part, RetuneOver, StopReason
 from loopwright.service.store.store import Busy
-from loopwright.service.store.tables import RetuneRow
+from loopwright.service.store.tables import BatchRow
 from loopwright.tuning.reasons import Reason
 
 log = logging.getLogger(__name__)
@@ -127,7 +127,7 @@ class BadFleet(ValueError):
 
 
 class Fleet:
-    """Runs the retunes of many loops that were requested from this host."""
+    """Runs the batches that were requested from this host."""
 
     def __init__(self, jobs: Jobs) -> None:
         self._jobs = jobs
@@ -159,26 +159,26 @@ class Fleet:
 
     def _end_all(self, why: str) -> None:
         with self._store.writing() as session:
-            for row in retunes.unfinished(session, self._store.host):
-                retunes.stop(session, row.id, StopReason.SERVICE_STOPPED, why)
+            for row in batches.unfinished(session, self._store.host):
+                batches.stop(session, row.id, StopReason.SERVICE_STOPPED, why)
 
     def _run(self) -> None:
         while not self._over.is_set():
             try:
                 self.poll()
             except FolderInUse as error:
-                log.error("another service runs the retunes of many loops: %s", error)
+                log.error("another service runs the batches: %s", error)
                 return
             except SQLAlchemyError as error:
-                log.warning("retunes of many loops wait for the database: %s", error)
+                log.warning("batches wait for the database: %s", error)
             except Exception:
-                log.exception("a defect in a retune of many loops")
+                log.exception("a defect in a batch")
             self._wake.wait(POLL_S)
             self._wake.clear()
 
     # requests
-    def start(self, request: FleetRequest) -> RetuneRow:
-        """Starts a retune of many loops. Raises BadFleet when one of the loops is unknown or does not permit the
+    def start(self, request: FleetRequest) -> BatchRow:
+        """Starts a batch. Raises BadFleet when one of the loops is unknown or does not permit the
         request, Stopping."""
         if self._jobs.stopping:
             raise Stopping(self._jobs.why_stopping)
@@ -193,12 +193,12 @@ class Fleet:
                 wrong.append(str(error) if tag not in known else f"{tag}: {error}")
         if wrong:
             raise BadFleet("; ".join(wrong))
-        by = signed(request.requested_by)
-        asked = {name: value for name, value in request.asked().items() if name != "loops"} | {"requested_by": by}
-        row: RetuneRow | None = None
+        by = signed(request.by)
+        asked = {name: value for name, value in request.asked().items() if name != "loops"} | {"by": by}
+        row: BatchRow | None = None
         try:
             with self._store.writing() as session:
-                row = retunes.add(session, self._store.host, asked, tags, by)
+                row = batches.add(session, self._store.host, asked, tags, by)
                 self._unanswered[row.id] = False
         except BaseException:
             if row is not None:
@@ -217,61 +217,61 @@ class Fleet:
             raise BadFleet("; ".join(wrong))
         return [known[tag][0] for tag in tags]
 
-    def abort(self, retune_id: str, by: str) -> RetuneRow:
+    def abort(self, batch_id: str, by: str) -> BatchRow:
         """Starts no more jobs, and asks the running jobs to stop: those that run here before anything is read or
         stored. While the database does not take the abort of such jobs, the abort waits in the journal. Raises
-        NoSuchRetune, RetuneOver, NotKnown."""
-        told = self._jobs.tell_all_of(retune_id)
+        NoSuchBatch, BatchOver, NotKnown."""
+        told = self._jobs.tell_all_of(batch_id)
         try:
             with self._store.writing() as session:
-                retunes.stop(session, retune_id, StopReason.OPERATOR, f"aborted by {by}", by)
+                batches.stop(session, batch_id, StopReason.OPERATOR, f"aborted by {by}", by)
         except SQLAlchemyError as error:
             if not told or not temporary(error):
                 raise
-            return self._stop_later(retune_id, by, told)
-        row, parts = self.get(retune_id)
+            return self._stop_later(batch_id, by, told)
+        row, parts = self.get(batch_id)
         self._abort(row, parts)
         self._wake.set()
         return row
 
-    def _stop_later(self, retune_id: str, by: str, told: Sequence[str]) -> RetuneRow:
+    def _stop_later(self, batch_id: str, by: str, told: Sequence[str]) -> BatchRow:
         """Stores an abort through the journal. Raises NotKnown. told: the jobs that have heard of it."""
         at = now()
 
         def write(session: Session) -> None:
-            with suppress(RetuneOver):  # nothing of it ran any more
-                retunes.stop(session, retune_id, StopReason.OPERATOR, f"aborted by {by}", by, at)
+            with suppress(BatchOver):  # nothing of it ran any more
+                batches.stop(session, batch_id, StopReason.OPERATOR, f"aborted by {by}", by, at)
 
-        self._aborted.add(retune_id)
+        self._aborted.add(batch_id)
         self._jobs.journal.put(as_asked(write))
         for job_id in told:
-            self._jobs.record_stop(job_id, f"retune {retune_id}")
+            self._jobs.record_stop(job_id, f"batch {batch_id}")
         try:
-            return self.get(retune_id)[0]
+            return self.get(batch_id)[0]
         except SQLAlchemyError as error:
             raise NotKnown(
-                f"the {len(told)} tests of retune {retune_id} that run at this gateway have been told to stop, and "
+                f"the {len(told)} tests of batch {batch_id} that run at this gateway have been told to stop, and "
                 "restore their loops; the database does not answer: that no more are begun is stored, and what has "
                 "become of each can be seen, when it is back"
             ) from error
 
     # queries
-    def get(self, retune_id: str) -> tuple[RetuneRow, list[Part]]:
-        """Returns a retune with its parts. Raises NoSuchRetune."""
+    def get(self, batch_id: str) -> tuple[BatchRow, list[Part]]:
+        """Returns a retune with its parts. Raises NoSuchBatch."""
         with self._store.reading() as session:
-            return retunes.find(session, retune_id), retunes.parts(session, retune_id)
+            return batches.find(session, batch_id), batches.parts(session, batch_id)
 
-    def recent(self, limit: int, before: int | None = None) -> list[tuple[RetuneRow, list[Part]]]:
-        """Returns the latest retunes of many loops with their parts, newest first."""
+    def recent(self, limit: int, before: int | None = None) -> list[tuple[BatchRow, list[Part]]]:
+        """Returns the latest batches with their parts, newest first."""
         with self._store.reading() as session:
-            return [(row, retunes.parts(session, row.id)) for row in retunes.recent(session, limit, before)]
+            return [(row, batches.parts(session, row.id)) for row in batches.recent(session, limit, before)]
 
     # the work
     def poll(self) -> None:
         """Makes one round over the retunes of this host: starts jobs where possible, and ends retunes that are over."""
         with self._looking:
             with self._store.reading() as session:
-                rows = retunes.unfinished(session, self._store.host)
+                rows = batches.unfinished(session, self._store.host)
             for row in rows:
                 if row.stop_reason is None and row.id in self._aborted:  # its abort waits in the journal
                     continue
@@ -282,9 +282,9 @@ class Fleet:
                 except (FolderInUse, SQLAlchemyError):
                     raise
                 except Exception:  # the others go on
-                    log.exception("a defect in the retune of many loops %s", row.id)
+                    log.exception("a defect in the batch %s", row.id)
 
-    def _answered(self, row: RetuneRow) -> bool:
+    def _answered(self, row: BatchRow) -> bool:
         """Whether the retune may begin: not while its request is being stored, nor where it was answered that this has
         failed, which stops it."""
         failed = self._unanswered.get(row.id)
@@ -293,7 +293,7 @@ class Fleet:
             del self._unanswered[row.id]
         return failed is None
 
-    def _one(self, row: RetuneRow, parts: list[Part]) -> None:
+    def _one(self, row: BatchRow, parts: list[Part]) -> None:
         if row.stop_reason is None:
             self._go_on(row, parts)
         elif row.stop_reason == StopReason.OPERATOR:
@@ -302,9 +302,9 @@ class Fleet:
         waits = row.stop_reason is None and any(part.waiting for part in parts)
         if not waits and not any(part.active for part in parts):
             with self._store.writing() as session:
-                retunes.end(session, row.id)
+                batches.end(session, row.id)
 
-    def _go_on(self, row: RetuneRow, parts: list[Part]) -> None:
+    def _go_on(self, row: BatchRow, parts: list[Part]) -> None:
         """Starts jobs where possible, unless too many have failed, or this version does not take the request that
         another has stored."""
         try:
@@ -321,11 +321,11 @@ class Fleet:
         else:
             self.begin(row, request, parts)
 
-    def _stop(self, row: RetuneRow, reason: StopReason, why: str) -> None:
+    def _stop(self, row: BatchRow, reason: StopReason, why: str) -> None:
         with self._store.writing() as session:
-            retunes.stop(session, row.id, reason, why)
+            batches.stop(session, row.id, reason, why)
 
-    def begin(self, row: RetuneRow, request: FleetRequest, parts: Sequence[Part]) -> None:
+    def begin(self, row: BatchRow, request: FleetRequest, parts: Sequence[Part]) -> None:
         """Starts jobs on the waiting loops, in order, as bus and area permit; tests of other requests count too."""
         known, options = self._known(), request.each()
         under_test = {part.loop for part in parts if part.active}
@@ -342,7 +342,7 @@ class Fleet:
             if any(taken[place] >= self._max(place, request) for place in places):
                 continue
             try:
-                self._jobs.start(part.loop, options, retunes.begins(row.id, part.position))
+                self._jobs.start(part.loop, options, batches.begins(row.id, part.position))
             except Busy:
                 continue  # another request started a job on this loop first
             except (BadLimits, UnknownLoop) as error:
@@ -351,21 +351,21 @@ class Fleet:
             except (Locked, RemoteSetpoint) as error:
                 self._give_up(row, part, error.detail, error.reason)
                 continue
-            except (Stopping, RetuneOver):
+            except (Stopping, BatchOver):
                 return
             taken.update(places)
 
-    def _give_up(self, row: RetuneRow, part: Part, detail: str, reason: Reason | None = None) -> None:
+    def _give_up(self, row: BatchRow, part: Part, detail: str, reason: Reason | None = None) -> None:
         with self._store.writing() as session:
-            retunes.give_up(session, row.id, part.position, detail, reason)
+            batches.give_up(session, row.id, part.position, detail, reason)
 
-    def _abort(self, row: RetuneRow, parts: Sequence[Part]) -> None:
+    def _abort(self, row: BatchRow, parts: Sequence[Part]) -> None:
         active = [part.job_id for part in parts if part.active and part.job_id is not None]
         for job_id in active:  # all jobs are asked before the first abort is stored
             self._jobs.tell_to_stop(job_id)
         for job_id in active:
             try:
-                self._jobs.ask_to_stop(job_id, f"retune {row.id}")
+                self._jobs.ask_to_stop(job_id, f"batch {row.id}")
             except IllegalMove:
                 continue  # the job has just ended
 

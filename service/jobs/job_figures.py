@@ -89,7 +89,7 @@ def _evaluated(row: Job, record: StoredRecord) -> Evaluation | None:
     evidence = record.experiment_record()
     if evidence is None:
         return None
-    asked = row.request.get("ms")
+    asked = row.request.get("Ms")
     for Ms in (float(asked) if isinstance(asked, int | float) else DesignSpec().Ms, _HIGHEST_MS):
         try:
             return evaluate_again(evidence, asked_spec(row, Ms))

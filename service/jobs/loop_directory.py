@@ -137,5 +137,5 @@ class LoopDirectory:
         """Returns the loop as its controller has it, or as it was at the start of the running job. Raises Ended."""
         active = self.store.active(tag)
         if active is not None and active.found is not None:
-            return replace(loop_state(active.found), gains=gains_of(active.old_gains))
+            return replace(loop_state(active.found), gains=gains_of(active.previous_gains))
         return self.read(tag)

@@ -197,7 +197,7 @@ class Jobs:
             made.append(Job.from_row(row))
 
         try:
-            by = signed(request.requested_by)
+            by = signed(request.by)
             row = self.store.create(tag, asked, by, request.dry_run, host, WORKFLOW_VERSION, make)
             self.engine.enqueue(row.id, self._rehearsals(host) if row.dry_run else self._queue(config, host))
         except Exception:
@@ -281,10 +281,10 @@ class Jobs:
         running.stop_reason = Reason.OPERATOR
         return True
 
-    def tell_all_of(self, retune_id: str) -> list[str]:
-        """Asks the jobs of a retune of many loops that run here to stop for an operator, as `tell_to_stop` does.
+    def tell_all_of(self, batch_id: str) -> list[str]:
+        """Asks the jobs of a batch that run here to stop for an operator, as `tell_to_stop` does.
         Returns those that are being stopped for one."""
-        mine = [job_id for job_id, each in self.registry.running.copy().items() if each.retune == retune_id]
+        mine = [job_id for job_id, each in self.registry.running.copy().items() if each.retune == batch_id]
         for job_id in mine:
             self.tell_to_stop(job_id)
         return [job_id for job_id in mine if self._heard(job_id)]

@@ -39,7 +39,7 @@ class PassingOn:
         loop: str,
         job_id: str | None,
         by: str,
-        roll_back_by_itself: bool | None = None,
+        auto_rollback: bool | None = None,
     ) -> bool:
         """Has the gateway `host` carry out a decision of the present caller. Returns whether it has; False: it has not
         answered in PATIENCE_S, and may still do so, if it begins within EXPIRES_S of the request.
@@ -51,7 +51,7 @@ class PassingOn:
         if age_s is None or age_s > gateways.LOST_S:
             raise GatewayLost(f"{gateways.silent(host, age_s)}; nothing was written to loop {loop}")
         try:
-            number = decision_requests.ask(self._store, host, what, loop, job_id, by, roll_back_by_itself)
+            number = decision_requests.ask(self._store, host, what, loop, job_id, by, auto_rollback)
         except SQLAlchemyError as error:
             raise _not_known(text, error) from error
         found = self._answered(number, host, text)

@@ -45,15 +45,14 @@ class Recovery:
         if self.stopping():
             return
         safe: Restoration | None = None
-        # A job of an earlier version has no session, but may have touched its loop.
-        if row.found is not None and (row.session is not None or row.version != WORKFLOW_VERSION):
+        if row.found is not None and row.session is not None:
             safe = restore_loop_of(row, self.loops, self.open_loop)
             self.store.append(row.id, "loop_found", {"text": safe.text}, row.plant_time_s)
         columns: JobColumns = {}
         if safe is not None and safe.state is not None:
             columns["restored"] = state_json(safe.state)
         elif safe is not None:
-            columns["look_after"] = True
+            columns["restore_unconfirmed"] = True
         if safe is not None and safe.held:
             columns |= {"reason": Reason.BAD_SAMPLE, "false_pv": True}
             columns["detail"] = f"{FALSE_PV_WORDS}, and was cut off by the end of the service: {_loop_words(safe)}"

@@ -1,5 +1,5 @@
-"""Watches loops after gains were accepted: compares operation with the model, and puts the old gains back by itself
-where something goes wrong and that was asked for.
+"""Watches loops after gains were accepted: compares operation with the model, and puts the previous gains back by
+itself where something goes wrong and that was asked for.
 
 Nothing is moved for it, and nothing delays a job: the history is what the listener has heard, comparisons are made in
 other processes with the lowest priority. What speaks against putting gains back, or leaves it in doubt, keeps the
@@ -140,7 +140,9 @@ class Watching:
 
     def _look(self, job_id: str, config: LoopConfig, watch: AcceptanceWatch) -> None:
         job, now_s, passed_s = self._store.get(job_id), self._wall(), self._passed_s()
-        if watch.trouble is not None and watch.trouble.put_back is None:  # this thread settles it before it looks again
+        if (
+            watch.trouble is not None and watch.trouble.rolled_back is None
+        ):  # this thread settles it before it looks again
             self._not_put_back(job_id, "the service ended, or could not write it down, meanwhile: read the loop")
         known = self._loops.setdefault(job_id, _LoopSeen(began_s=passed_s, inside=watch.inside))
         why = self._over(job, watch, known, now_s)
@@ -152,12 +154,12 @@ class Watching:
             watch = watches.change(self._store, job_id, partial(watches.set_back, now_s=now_s)) or watch
             known.due_s = max(known.due_s, passed_s + _LEAST_S)  # the listener drops what it has heard before meanwhile
         heard = self._listening.heard.get(config.tag)
-        not_heard = self._listening.why_not_heard(config.tag)
-        if not_heard is None and (heard is None or heard.silent):
-            not_heard = "no data of the loop"
-        if not_heard != watch.not_heard:
-            watches.change(self._store, job_id, lambda now: now.model_copy(update={"not_heard": not_heard}))
-        if not_heard is not None or heard is None:
+        no_data = self._listening.why_not_heard(config.tag)
+        if no_data is None and (heard is None or heard.silent):
+            no_data = "no data of the loop"
+        if no_data != watch.no_data:
+            watches.change(self._store, job_id, lambda now: now.model_copy(update={"no_data": no_data}))
+        if no_data is not None or heard is None:
             known.outside_from_s = None
             return
         if known.mode == Mode.AUTOMATIC and heard.mode not in (UNKNOWN_MODE, Mode.AUTOMATIC):
@@ -235,10 +237,10 @@ class Watching:
 
     def _disarmed(self, job_id: str, watch: AcceptanceWatch, left_s: float) -> AcceptanceWatch:
         """The watch of a loop that has left automatic at this wall time, s. Raises SQLAlchemyError, FolderInUse."""
-        if watch.disarmed is not None or not watch.roll_back_by_itself:
+        if watch.auto_rollback_off is not None or not watch.auto_rollback:
             return watch
         text = f"the mode was changed at {stamp(_utc(left_s))}"
-        return watches.change(self._store, job_id, partial(_with, disarmed=text)) or watch
+        return watches.change(self._store, job_id, partial(_with, auto_rollback_off=text)) or watch
 
     def _question(self, job: Job, config: LoopConfig, watch: AcceptanceWatch) -> Question:
         state = _state(job)
@@ -270,7 +272,7 @@ class Watching:
                 changes = (*watch.changes, *found.changes)
                 make = partial(_with, changes=changes, looked_to_s=found.looked_to_s)
                 later = watches.change(self._store, job_id, make)
-                log.info("watched %s: %s", job.loop, later.words if later else "the watch has ended")
+                log.info("watched %s: %s", job.loop, later.message if later else "the watch has ended")
 
     # what goes wrong
 
@@ -279,12 +281,12 @@ class Watching:
         if watch.trouble is not None:
             return
         why_not = "what a false PV shows is no reason to change gains"
-        trouble = Trouble(kind=TroubleKind.FALSE_PV, at=now(), text=text, put_back=False, why_not=why_not)
+        trouble = Trouble(kind=TroubleKind.FALSE_PV, at=now(), text=text, rolled_back=False, reason=why_not)
         if watches.change(self._store, job.id, partial(_with, trouble=trouble)) is not None:
             log.warning("%s: %s", job.loop, text)
 
     def _trouble(self, job: Job, config: LoopConfig, watch: AcceptanceWatch, kind: TroubleKind, text: str) -> None:
-        """Notes what went wrong, and puts the old gains back where that was asked for, unless PV is false."""
+        """Notes what went wrong, and puts the previous gains back where that was asked for, unless PV is false."""
         if watch.trouble is not None:
             return
         false = false_pv(self._question(job, config, watch), watch.period_s, watch.since_s)
@@ -298,17 +300,19 @@ class Watching:
             return
         log.warning("%s: %s", job.loop, text)
         if not watch.armed:
-            self._not_put_back(job.id, watch.disarmed or "that was not asked for as the new ones were accepted")
+            self._not_put_back(
+                job.id, watch.auto_rollback_off or "that was not asked for as the new ones were accepted"
+            )
             return
         try:
             self._decisions.roll_back_accepted(job.id, BY)
         except (Ended, Conflict, Locked, Busy, IllegalMove) as error:
             why = error.detail if isinstance(error, Ended) else str(error)
-            log.error("the old gains of %s could not be put back: %s", job.loop, why)
+            log.error("the previous gains of %s could not be put back: %s", job.loop, why)
             self._not_put_back(job.id, why)
 
     def _not_put_back(self, job_id: str, why: str) -> None:
-        watches.settle(self._store, job_id, partial(watches.settled, put_back=False, why_not=why))
+        watches.settle(self._store, job_id, partial(watches.settled, rolled_back=False, reason=why))
 
     def _end(self, job_id: str, why: WatchEnd) -> None:
         log.info("the watch of job %s has ended: %s", job_id, why)

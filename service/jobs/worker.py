@@ -52,7 +52,7 @@ from loopwright.service.states.loop_state import (
     same_gains,
     state_json,
 )
-from loopwright.service.store import looked_after
+from loopwright.service.store import unconfirmed_restorations
 from loopwright.service.store.job_rows import NoSuchJob
 from loopwright.service.store.jobs import Job, JobColumns
 from loopwright.service.store.lock import FolderInUse
@@ -217,8 +217,8 @@ class Worker:
         service's reading. The note goes through the journal: the session is open, and waits for no database."""
         columns: JobColumns = {}
         if differences(home, read):
-            columns = {"found": state_json(home), "old_gains": asdict(home.gains)}
-        self.journal.put(looked_after.opened(job_id, columns))
+            columns = {"found": state_json(home), "previous_gains": asdict(home.gains)}
+        self.journal.put(unconfirmed_restorations.opened(job_id, columns))
         if not same_gains(home.gains, read.gains):  # the plan is based on the gains that were read
             raise Aborted(Reason.GAINS_CHANGED, "other gains were accepted as the test was about to begin")
 
@@ -227,7 +227,7 @@ class Worker:
         if row.found is None or row.session is None:
             # No attempt has touched the loop; the state that an earlier one read may have been another tuner's test.
             state = loop.read(beside_tests=True)
-            columns: JobColumns = {"old_gains": asdict(state.gains), "found": state_json(state)}
+            columns: JobColumns = {"previous_gains": asdict(state.gains), "found": state_json(state)}
             self._ask_what_was_found(loop, row.loop)
             if row.found is None:
                 columns["attempt"] = 1
@@ -249,13 +249,15 @@ class Worker:
     def _ask_what_was_found(self, loop: Loop, tag: str) -> None:
         """Notes a test that was cut off and has had this loop held, where no look has found that yet: the controller
         knows it only until the next session."""
-        for earlier in self._lasting(lambda: looked_after.rows(self.store, tag)):
+        for earlier in self._lasting(lambda: unconfirmed_restorations.rows(self.store, tag)):
             if earlier.found is None or earlier.session is None:
                 continue
             safe = restore_abandoned(loop, loop_state(earlier.found), earlier.session)
             if safe.held and safe.state is not None:
                 restored, text = state_json(safe.state), safe.text
-                self._lasting(partial(looked_after.home_again, self.store, earlier.id, restored, text, held=True))
+                self._lasting(
+                    partial(unconfirmed_restorations.confirmed, self.store, earlier.id, restored, text, held=True)
+                )
 
     def _dry(self, running: Running, row: Job, config: LoopConfig, request: RetuneRequest) -> Outcome:
         if row.state is JobState.QUEUED:
@@ -317,7 +319,7 @@ class Worker:
         if outcome.restored is not None:
             columns["restored"] = state_json(outcome.restored)
         elif self._lasting(lambda: self.store.get(running.job_id)).session is not None:
-            columns["look_after"] = True
+            columns["restore_unconfirmed"] = True
         state = JobState.REHEARSED if dry_run else JobState.PROPOSED
         if outcome.ended is not None:
             state = state_after(outcome.ended)

@@ -34,7 +34,7 @@ from loopwright.service.store import history
 from loopwright.service.store.clock_watch import uptime_s
 from loopwright.service.store.history import HistoryBlock
 from loopwright.service.store.store import Store
-from loopwright.service.telemetry.metrics import FRAMES_HEARD, LISTENING_UP
+from loopwright.service.telemetry.metrics import FRAMES_RECEIVED, LISTENING_UP
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Ended
 
@@ -60,11 +60,11 @@ NOT_BEGUN = "listening has not begun yet"
 class History:
     """The history of a loop in a time.
 
-    not_heard: why the loop is not heard at present; None where it is.
+    no_data: why the loop is not heard at present; None where it is.
     """
 
     rows: Rows
-    not_heard: str | None
+    no_data: str | None
 
 
 class Listening:
@@ -132,10 +132,10 @@ class Listening:
     def history(self, tag: str, from_s: float, to_s: float, points: int) -> History:
         """Returns at most `points` bins of a loop of any host, from memory and from the database. Raises
         SQLAlchemyError."""
-        answer, not_heard = self._memory(tag, from_s, to_s, points)
+        answer, no_data = self._memory(tag, from_s, to_s, points)
         oldest_s = math.inf if answer is None else answer.oldest_s
         stored = self._stored(tag, from_s, min(to_s, oldest_s), points) if from_s < oldest_s else []
-        return History(_whole(stored, answer, from_s, to_s, points), not_heard)
+        return History(_whole(stored, answer, from_s, to_s, points), no_data)
 
     def watch(self, tags: Collection[str]) -> None:
         """Asks for the new samples of these loops, which `on_samples` gets."""
@@ -147,7 +147,7 @@ class Listening:
     def why_not_heard(self, tag: str) -> str | None:
         """Returns why a loop is not heard at present, as far as its bus is the reason; None: its bus is heard."""
         if tag not in self._loops:
-            return "the loop belongs to another host"
+            return "the loop belongs to another gateway"
         url = self._loops[tag].bus
         if url in self.off:
             return self.off[url]
@@ -182,7 +182,7 @@ class Listening:
     def _memory(self, tag: str, from_s: float, to_s: float, points: int) -> tuple[HistoryAnswer | None, str | None]:
         """Returns what is in memory, and why the loop is not heard."""
         if tag not in self._loops:
-            return None, "the loop belongs to another host, which stores its history once a minute"
+            return None, "the loop belongs to another gateway, which stores its history once a minute"
         url = self._loops[tag].bus
         if url in self.off:
             return None, self.off[url]
@@ -229,7 +229,7 @@ class Listening:
     def _take(self, report: Report) -> None:
         self._down, self.heard, self.nodes = report.down, report.heard, report.nodes
         for url, frames in report.frames.items():
-            FRAMES_HEARD.labels(url).inc(frames)
+            FRAMES_RECEIVED.labels(url).inc(frames)
             LISTENING_UP.labels(url).set(0 if url in report.down else 1)
         self._begun = True
         self._to_read = report.to_read

@@ -103,7 +103,7 @@ class Live:
             yield f"retry: {RETRY_MS}\n" + event(
                 "hello",
                 Hello(
-                    host=self._jobs.store.host, version=version("loopwright"), now_s=round(time.time(), 3),
+                    gateway=self._jobs.store.host, version=version("loopwright"), now_s=round(time.time(), 3),
                     loops=list(tags), back_s=back_s,
                 ),
             )  # fmt: skip

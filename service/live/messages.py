@@ -15,7 +15,7 @@ RETRY_MS = 2000
 class Hello(BaseModel):
     """The first message."""
 
-    host: str = Field(description="Name of the service that answers")
+    gateway: str = Field(description="Name of the gateway that answers")
     version: str
     now_s: float = Field(description="Wall time of the service, s")
     loops: list[str] = Field(description="The loops whose samples and events are sent")
@@ -51,17 +51,17 @@ class LoopValues(BaseModel):
     age_s: float | None = Field(description="Age of the last sample, s; null: no sample came")
     under_test: bool | None = Field(description="Whether a tuner, this service or another, has a session open")
     on_trial: bool | None = Field(description="Whether gains are on trial")
-    not_heard: str | None = Field(description="Why there are no values; null: there are")
+    no_data: str | None = Field(description="Why there are no values; null: there are")
     last: OldValues | None = Field(
         default=None,
-        description="What was heard last, `age_s` ago, where no values are present; null: they are, or none came",
+        description="The last values, `age_s` ago, where no values are present; null: they are, or none came",
     )
 
 
 class LiveLoopRow(LoopValues):
     """The present state of a loop."""
 
-    host: str = Field(description="The gateway that has the loop")
+    gateway: str = Field(description="The gateway that has the loop")
     job: str | None = Field(description="URL of the job that has the loop")
     last_job: LastJob | None
     locked_since: str | None = Field(
@@ -80,10 +80,10 @@ class BusView(BaseModel):
     """A bus of a gateway. up: null where the bus is not listened to, or not yet, or is of a gateway that does not
     answer."""
 
-    host: str
+    gateway: str
     bus: str
     up: bool | None
-    why: str | None = Field(description="Why the bus is not heard; null: it is")
+    why: str | None = Field(description="Why there is no data of the bus; null: there is")
 
 
 class Buses(BaseModel):
@@ -111,15 +111,15 @@ class Samples(BaseModel):
 
 
 class LiveJob(BaseModel):
-    """A job that is queued or running. The progress of another host's is a second old."""
+    """A job that is queued or running. The progress of another gateway's is a second old."""
 
     id: str
     url: str
     loop: str
-    host: str
+    gateway: str
     state: JobState
     dry_run: bool
-    requested_by: str
+    by: str
     stage: str | None
     progress: float | None = Field(description="Fraction of the expected plant time, 0 to 1")
     remaining_plant_time_s: float | None
@@ -129,7 +129,7 @@ class LiveJob(BaseModel):
 
 
 class LiveJobs(BaseModel):
-    """The live jobs of every host, when something has changed."""
+    """The live jobs of every gateway, when something has changed."""
 
     jobs: list[LiveJob]
 

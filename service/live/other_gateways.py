@@ -144,7 +144,7 @@ class OtherGateways:
         for name, each in self._found.items():
             if name != self._store.host:
                 why = self.why_no_data(name)
-                known = {"host": name} if why is None else {"host": name, "up": None, "why": why}
+                known = {"gateway": name} if why is None else {"gateway": name, "up": None, "why": why}
                 found += [bus.model_copy(update=known) for bus in each.buses]
         return found
 

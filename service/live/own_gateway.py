@@ -66,7 +66,7 @@ class OwnGateway:
         """Returns its buses as they are."""
         off, begun = self._listening.off, self._listening.begun
         return [
-            BusView(host=self.name, bus=url, up=why is None if begun and url not in off else None, why=why)
+            BusView(gateway=self.name, bus=url, up=why is None if begun and url not in off else None, why=why)
             for url, why in self._listening.buses().items()
         ]
 

@@ -47,7 +47,7 @@ def with_jobs(
     """Returns the row of a loop with these values."""
     return LiveLoopRow(
         **dict(values),
-        host=host,
+        gateway=host,
         job=None if job is None else f"/jobs/{job.id}",
         last_job=None if last_job is None else LastJob(url=f"/jobs/{last_job.id}", state=last_job.state),
         locked_since=locked_since,
@@ -66,7 +66,7 @@ def loop_values(tag: str, known: LiveFacts, now_s: float) -> LoopValues:
         row.pv, row.sp, row.mv = (_finite(value) for value in (held.pv, held.sp, held.mv))
         row.mode, row.on_trial = held.mode.name.lower(), held.on_trial
     else:
-        row.not_heard = known.deaf or ("no sample has come yet" if age_s is None else f"no data for {age_s:.0f} s")
+        row.no_data = known.deaf or ("no sample has come yet" if age_s is None else f"no data for {age_s:.0f} s")
         if heard is not None:
             pv, sp, mv, mode = _values(heard)
             row.last = OldValues(pv=pv, sp=sp, mv=mv, mode=mode)
@@ -75,17 +75,17 @@ def loop_values(tag: str, known: LiveFacts, now_s: float) -> LoopValues:
     return row
 
 
-def no_values(tag: str, not_heard: str | None, age_s: float | None, last: OldValues | None = None) -> LoopValues:
+def no_values(tag: str, no_data: str | None, age_s: float | None, last: OldValues | None = None) -> LoopValues:
     """Returns the values of a loop whose present ones are not known. age_s, last: of its last sample."""
     return LoopValues(
         tag=tag, pv=None, sp=None, mv=None, mode=None, age_s=None if age_s is None else round(age_s, 3),
-        under_test=None, on_trial=None, not_heard=not_heard, last=last,
+        under_test=None, on_trial=None, no_data=no_data, last=last,
     )  # fmt: skip
 
 
 def old(values: LoopValues) -> OldValues | None:
     """Returns the values that are still known when these are no longer present ones; None: there are none."""
-    if values.not_heard is not None:
+    if values.no_data is not None:
         return values.last
     return OldValues(pv=values.pv, sp=values.sp, mv=values.mv, mode=values.mode)
 

@@ -59,7 +59,7 @@ class LoopSettings(BaseModel):
     sample_time_s: float
     reverse_acting: bool
     node_state: str
-    when_silent: str
+    fail_action: str
 
     @classmethod
     def of(cls, state: LoopState) -> LoopSettings:
@@ -70,7 +70,7 @@ class LoopSettings(BaseModel):
             sample_time_s=state.sample_time_s,
             reverse_acting=state.reverse_acting,
             node_state=state.node_state,
-            when_silent=state.when_silent,
+            fail_action=state.fail_action,
         )
 
 

@@ -61,7 +61,7 @@ def why_over(reading: BusReading, number: int, pv_silence_s: float) -> Ended:
     text = f"the controller ended the test by itself ({words_of(cause)})"
     if cause is Cause.LEASE:
         text += f"; at most {tuner.longest_between_renewals_s:.1f} s passed between two renewals of the lease"
-    return Failed(Reason.DEVICE_WENT_BACK, text)
+    return Failed(Reason.SESSION_ENDED_BY_DEVICE, text)
 
 
 def _pv_left(tuner: Tuner) -> str:

@@ -103,7 +103,7 @@ class BusReading:
     def state(self) -> LoopState:
         """Returns the present state, with the accepted gains: a trial ends with these."""
         number = self.tuner.number
-        plant_state, when_silent = self._plant_state()
+        plant_state, fail_action = self._plant_state()
         own = int(number("node_state", node=self.controller))
         away = [] if own == NmtState.OPERATIONAL else [f"node {node_name(self.controller)} is {state_name(own)}"]
         if plant_state != OPERATIONAL:
@@ -121,7 +121,7 @@ class BusReading:
             reverse_acting=number("controller_action") == 0,
             manual_output=number("controller_manual_output"),
             node_state="; ".join(away) or OPERATIONAL,
-            when_silent=when_silent,
+            fail_action=fail_action,
         )
 
     def beside_the_test(self) -> LoopState:

@@ -50,9 +50,7 @@ def restore_abandoned(loop: Loop, home: LoopState, session: int | None) -> Resto
     try:
         restored = loop.restore(home, session or 0)
     except Ended as ended:
-        return Restoration(
-            None, f"not confirmed: {ended.detail}; the controller brings it home by itself", ended.reason
-        )
+        return Restoration(None, f"not confirmed: {ended.detail}; the controller restores it by itself", ended.reason)
     if restored.held:
         text = f"{restored.how}; {after_false_pv(restored.state)}"
         if restored.changed:
@@ -78,4 +76,4 @@ def restore_loop_of(row: Job, loops: Mapping[str, LoopConfig], open_loop: Callab
             loop.close()
     except Exception as error:
         log.exception("loop %s", row.loop)
-        return Restoration(None, f"not reached: {error}; the controller brings it home by itself", Reason.BUS_LOST)
+        return Restoration(None, f"not reached: {error}; the controller restores it by itself", Reason.BUS_LOST)

@@ -38,7 +38,7 @@ class Compared:
     looked_to_s: float
 
 
-def watched(by: str, roll_back_by_itself: bool, config: LoopConfig) -> Callable[[Session, JobRow], None]:
+def watched(by: str, auto_rollback: bool, config: LoopConfig) -> Callable[[Session, JobRow], None]:
     """Begins the watch of an acceptance in its transaction."""
 
     def write(session: Session, job: JobRow) -> None:
@@ -49,7 +49,7 @@ def watched(by: str, roll_back_by_itself: bool, config: LoopConfig) -> Callable[
             AcceptanceWatch(
                 since=now(),
                 by=by,
-                roll_back_by_itself=roll_back_by_itself,
+                auto_rollback=auto_rollback,
                 period_s=PERIOD_OF_T95 * config.t95_s if model is None else model.period_s,
                 model="the job has no model with an ultimate period" if model is None else None,
             ),

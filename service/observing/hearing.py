@@ -61,7 +61,7 @@ def question(
         found.rows,
         together,
         [each for each in times if each is not None],
-        found.not_heard,
+        found.no_data,
         tuple(sorted({each.loop for each in theirs})),
     )
 

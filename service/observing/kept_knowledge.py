@@ -80,7 +80,7 @@ class KeptKnowledge:
                 instead_of = knowledge.replaced(finding, findings)
                 others = [each for each in findings if each.number not in instead_of]
                 older = knowledge.disagreeing(finding, others)
-                agreeing = [each for each in others if each.older_plant is None and each.number not in older]
+                agreeing = [each for each in others if each.superseded is None and each.number not in older]
                 best = knowledge.best(agreeing, finding.present.gains.gains()).number if agreeing else None
                 stored.add(self._store, tag, finding, older, instead_of, best)
         except (SQLAlchemyError, FolderInUse) as error:

@@ -57,7 +57,7 @@ def of_observation(found: ObservationView, Ms_asked: float, sample_time_s: float
         at=stamp(at),
         changes=len(found.changes_used),
         last_change_s=max(each.at_s for each in found.changes_used),
-        sample_s=found.heard.sample_s,
+        sample_s=found.data.sample_s,
         present=found.present,
         proposed=found.proposed,
         Ms_asked=Ms_asked,
@@ -78,19 +78,19 @@ def of_test(
     found = job.result
     if job.dry_run or job.ended_at is None or not isinstance(found, FastResult):
         return None
-    if found.model is None or found.evidence is None or found.old_gains is None or found.known_before is None:
+    if found.model is None or found.evidence is None or found.previous_gains is None or found.known_previous is None:
         return None
     proposed: KnownGainsView | None = None
     if found.new_gains is not None and found.evidence.uncertainty is not None:
         known = max(found.evidence.uncertainty, found.evidence.ambiguity)
         proposed = KnownGainsView(gains=found.new_gains, Ms=found.evidence.Ms, uncertainty=known)
-    before = found.known_before
+    before = found.known_previous
     return Finding(
         source=FindingSource.JOB,
         at=job.ended_at,
         job=job.id,
         method=found.method,
-        present=KnownGainsView(gains=found.old_gains, Ms=before.Ms, uncertainty=before.uncertainty),
+        present=KnownGainsView(gains=found.previous_gains, Ms=before.Ms, uncertainty=before.uncertainty),
         proposed=proposed,
         Ms_asked=found.comparison.Ms_asked if found.comparison else None,
         model=found.model,
@@ -108,7 +108,7 @@ def of_trial(job: Job, findings: Sequence[Known], at: datetime) -> Finding | Non
     if not isinstance(found, FastResult) or found.model is None or not found.model.typed_in or found.new_gains is None:
         return None
     model, gains = found.model, found.new_gains
-    in_effect = [each.finding for each in reversed(findings) if not each.older_plant]
+    in_effect = [each.finding for each in reversed(findings) if not each.superseded]
     base = next((each for each in in_effect if _same(each.model, model)), None)
     base = base or next((each for each in in_effect if _same_Ms(each, model, gains.gains())), None)
     if base is None:
@@ -149,7 +149,7 @@ def adds_nothing(finding: Finding, findings: Sequence[Known]) -> bool:
     """Whether the same is known better already: an earlier look had more of the history before the same latest
     set-point change."""
     return any(
-        each.older_plant is None
+        each.superseded is None
         and _repeats(finding, each.finding)
         and _disagreement(finding, each.finding) is None
         and _uncertainty(each.finding, finding.present.gains.gains()) < (finding.present.uncertainty or math.inf)
@@ -169,8 +169,8 @@ def _repeats(newer: Finding, older: Finding) -> bool:
 
 
 def of_operation(findings: Sequence[Known]) -> list[int]:
-    """The numbers of the findings that come from normal operation, tried on the loop or not, and count still."""
-    return [each.number for each in findings if each.finding.changes is not None and each.older_plant is None]
+    """The numbers of the findings that come from normal operation, tested on the loop or not, and count still."""
+    return [each.number for each in findings if each.finding.changes is not None and each.superseded is None]
 
 
 # -- what of them is in effect
@@ -221,7 +221,7 @@ def disagreeing(finding: Finding, findings: Sequence[Known]) -> dict[int, str]:
     """The findings that do not agree with a newer one, by number, each with the reason in words."""
     found = {}
     for each in findings:
-        if each.older_plant is None and (why := _disagreement(finding, each.finding)) is not None:
+        if each.superseded is None and (why := _disagreement(finding, each.finding)) is not None:
             found[each.number] = why
     return found
 
@@ -274,7 +274,7 @@ def known(findings: Sequence[Known], gains: Gains | None) -> KnowledgeView | Non
     findings: oldest first.
     gains: the gains in effect; None: those of the latest finding.
     """
-    valid = [each for each in findings if each.older_plant is None]
+    valid = [each for each in findings if each.superseded is None]
     if not valid:
         return None
     gains = gains or valid[-1].finding.present.gains.gains()
@@ -298,8 +298,8 @@ def known(findings: Sequence[Known], gains: Gains | None) -> KnowledgeView | Non
         model=finding.model,
         proposed=proposed,
         Ms_asked=finding.Ms_asked,
-        agreeing=len(valid) - 1,
-        older_plant=next((each.older_plant for each in reversed(findings) if each.older_plant), None),
+        consistent=len(valid) - 1,
+        superseded=next((each.superseded for each in reversed(findings) if each.superseded), None),
     )
 
 

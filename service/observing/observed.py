@@ -41,8 +41,8 @@ from loopwright.tuning.operation.observation import Observation, observe
 from loopwright.tuning.reasons import Reason, Refused
 
 NEVER_TRIED = (
-    "These gains were never tried on this loop: they come from what operators did, and hold for the range of PV and MV "
-    "given. The request `retune` puts them on trial with a set-point step, and ends with a proposal."
+    "These gains were never tested on this loop: they come from what operators did, and hold for the range of PV and "
+    "MV given. The request `retune` puts them on trial with a set-point step, and ends with a proposal."
 )
 WAIT = "Wait for further or larger set-point changes, or retune by setpoint or fast, which move the loop themselves."
 ADVICE = {
@@ -83,7 +83,7 @@ class ObservedLoadView(Figures):
     size: float = Field(description="Size at the plant's input, MV percent")
 
 
-class HeardView(Figures):
+class DataView(Figures):
     """What there was to look at."""
 
     from_s: float | None = Field(description=f"Begin of the first stretch in automatic, {_UNIX}; null: there is none")
@@ -91,7 +91,7 @@ class HeardView(Figures):
     stretches: int = Field(description="Stretches in automatic under known gains and set-point, without a gap")
     duration_s: float = Field(description="Their length together, plant time, s")
     sample_s: float = Field(description="Length of one sample that was looked at, plant time, s", examples=[0.5])
-    not_heard: str | None = Field(description="Why the loop is not heard at present; null: it is")
+    no_data: str | None = Field(description="Why there is no data of the loop at present; null: there is")
     disturbed_by: list[str] = Field(
         description="Tags of neighbours (of the same area, or whose outer_loop this loop is) that were under test; "
         "these times are left out, as those of tests of the loop itself are",
@@ -118,7 +118,7 @@ class OperationView(Figures):
     proposed: KnownGainsView | None = Field(description="Designed gains; null: not known well enough")
     ultimate: UltimateView | None = Field(description="The ultimate point of the model")
     predicted: PredictedView | None = Field(description="Predicted performance of the designed gains")
-    predicted_before: PredictedView | None = Field(
+    predicted_previous: PredictedView | None = Field(
         description="Predicted performance of the present gains; null: not known, or not stable"
     )
     comparison: ComparisonView | None = Field(description="Present and designed gains on the model")
@@ -130,21 +130,21 @@ class ObservationView(OperationView):
     loop: str = Field(examples=["TIC-101"])
     pv_unit: str = Field(description="Unit of PV and SP", examples=["degC"])
     method: Literal["observe"] = "observe"
-    heard: HeardView
+    data: DataView
     changes_used: list[ObservedChangeView] = Field(description="Set-point changes that one plant explains")
     changes_dropped: list[ObservedChangeView] = Field(
         description="Set-point changes that do not fit these: disturbed, or of an older plant"
     )
     loads: list[ObservedLoadView] = Field(description="Load disturbances that were found and allowed for")
-    tried: Literal[False] = Field(default=False, description="Always false: nothing was tried on the loop")
-    tried_text: str | None = Field(description="That sentence, where gains are proposed", examples=[NEVER_TRIED])
+    tested_on_loop: Literal[False] = Field(default=False, description="Always false: nothing was tested on the loop")
+    tested_text: str | None = Field(description="That sentence, where gains are proposed", examples=[NEVER_TRIED])
     knowledge: KnowledgeView | None = Field(
         default=None,
         description="What is known of the loop with this and from its tests; null: nothing is",
     )
     retune: dict[str, object] | None = Field(
         description="Body for POST /loops/{tag}/retune that tries the proposed gains on the loop",
-        examples=[{"method": "fast", "start": "design", "ms": 1.6, "model": {"num": [2.0], "den": [3.0, 1.0]}}],
+        examples=[{"method": "fast", "start": "design", "Ms": 1.6, "model": {"num": [2.0], "den": [3.0, 1.0]}}],
     )
 
 
@@ -155,7 +155,7 @@ class Question:
     config, state: the loop's configuration and its state as read.
     spec: what the gains are designed for.
     rows, together, tests: the history, see `heard_stretches`.
-    not_heard: why the loop is not heard at present.
+    no_data: why the loop is not heard at present.
     disturbed_by: the neighbours whose tests are among these.
     """
 
@@ -165,7 +165,7 @@ class Question:
     rows: Rows
     together: int
     tests: Sequence[tuple[float, float]]
-    not_heard: str | None
+    no_data: str | None
     disturbed_by: tuple[str, ...] = ()
 
     @property
@@ -205,7 +205,7 @@ def _observed(question: Question, heard: Sequence[HeardStretch]) -> tuple[Observ
         text = f"the set-point comes from {outer} (setpoint_from: remote in loops.yaml), which follows what PV does"
         return _answered(question, heard, Observation(Reason.SETPOINT_IS_DRIVEN, text), None)
     if not heard:
-        why = f"{question.not_heard}" if question.not_heard else "nothing in automatic under known gains was heard yet"
+        why = f"{question.no_data}" if question.no_data else "there are no data in automatic under known gains yet"
         return _answered(question, heard, Observation(Reason.UNCERTAIN, why), None)
     try:
         facts = facts_of(question.config, question.state)
@@ -233,11 +233,11 @@ def _answer(
     fields: dict[str, object] = {
         "loop": config.tag,
         "pv_unit": config.pv_unit,
-        "heard": _heard(question, heard),
+        "data": _data(question, heard),
         "changes_used": [_change(each, heard) for each in found.used],
         "changes_dropped": [_change(each, heard) for each in found.dropped],
         "loads": [] if evaluation is None else _loads(evaluation, found.used, heard),
-        "tried_text": NEVER_TRIED if proposal else None,
+        "tested_text": NEVER_TRIED if proposal else None,
         "retune": _trial(evaluation, question.spec) if evaluation and proposal else None,
     }
     return ObservationView.model_validate(json_object(common | fields))
@@ -268,8 +268,10 @@ def operation_fields(found: Observation, compared: Comparison | None, present: G
         "present": _known(None if trusted is None else found.known_Ms(present), present),
         "proposed": None if designed is None else _known(found.known_Ms(designed.best.gains), designed.best.gains),
         "ultimate": None if evaluation is None else ultimate(evaluation.model),
-        "predicted": None if compared is None else predicted(compared.after),
-        "predicted_before": predicted(compared.before) if compared is not None and compared.before.stable else None,
+        "predicted": None if compared is None else predicted(compared.new),
+        "predicted_previous": predicted(compared.previous)
+        if compared is not None and compared.previous.stable
+        else None,
         "comparison": compared,
     }
 
@@ -291,14 +293,14 @@ def _known(found: KnownMs | None, gains: Gains) -> dict[str, object]:
     }
 
 
-def _heard(question: Question, heard: Sequence[HeardStretch]) -> dict[str, object]:
+def _data(question: Question, heard: Sequence[HeardStretch]) -> dict[str, object]:
     return {
         "from_s": float(heard[0].at_s[0]) if heard else None,
         "to_s": float(heard[-1].at_s[-1]) if heard else None,
         "stretches": len(heard),
         "duration_s": sum(len(each.stretch.sp) for each in heard) * question.sample_s,
         "sample_s": question.sample_s,
-        "not_heard": question.not_heard,
+        "no_data": question.no_data,
         "disturbed_by": question.disturbed_by,
     }
 
@@ -342,5 +344,5 @@ def _range(columns: Sequence[np.ndarray[tuple[int], np.dtype[np.float64]]]) -> d
 def _trial(evaluation: Evaluation, spec: DesignSpec) -> dict[str, object]:
     model = evaluation.model
     given = {"num": list(model.num), "den": list(model.den), "dead_time_s": model.L}
-    asked = {"ms": spec.Ms, "derivative": spec.derivative, "aim": spec.aim, **spec.requirements}
+    asked = {"Ms": spec.Ms, "derivative": spec.derivative, "aim": spec.aim, **spec.requirements}
     return {"method": FAST, "start": "design", **asked, "model": given}

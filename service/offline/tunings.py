@@ -53,12 +53,12 @@ class BadTuning(ValueError):
 class MethodResult:
     """The result of one method: the gains with their assessment on the model, or the refusal.
 
-    chosen: the design parameters in effect, by name with unit.
+    design: the design parameters in effect, by name with unit.
     """
 
     method: Method
     gains: Gains | None = None
-    chosen: Mapping[str, float] | None = None
+    design: Mapping[str, float] | None = None
     notes: tuple[str, ...] = ()
     assessment: Assessment | None = None
     refusal: Ended | None = None
@@ -140,7 +140,7 @@ def as_json(found: MethodResult) -> JsonObject:
             "parallel": {"Kp": parallel.Kp, "Ki": parallel.Ki, "Kd": parallel.Kd, "Tf": parallel.Tf}
             if parallel
             else None,
-            "chosen": dict(found.chosen) if found.chosen is not None else None,
+            "design": dict(found.design) if found.design is not None else None,
             "notes": list(found.notes),
             "margins": _margins(assessed) if assessed else None,
             "setpoint": _figures(assessed.setpoint) if assessed else None,

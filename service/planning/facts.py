@@ -27,7 +27,7 @@ def facts_of(config: LoopConfig, state: LoopState) -> Facts:
         mv_low=max(config.mv_limits.low, state.mv_low),
         mv_high=min(config.mv_limits.high, state.mv_high),
         sp_deviation=config.sp_deviation,
-        old_gains=state.gains,
+        previous_gains=state.gains,
         reverse=state.reverse_acting,
         mv_step_max=config.test.mv_step_max or math.inf,
         pv_low=config.pv_limits.low,

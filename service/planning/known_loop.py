@@ -32,7 +32,7 @@ def known(store: Store, tag: str, read: Callable[[], LoopState]) -> Ground:
     if row is None or row.found is None:
         return Ground(last, silence=words)
     accepted = row.result.new_gains if row.state is JobState.ACCEPTED and row.result is not None else None
-    gains = gains_of(row.old_gains or row.found["gains"]) if accepted is None else accepted.gains()
+    gains = gains_of(row.previous_gains or row.found["gains"]) if accepted is None else accepted.gains()
     return Ground(last, replace(loop_state(row.found), gains=gains), row.id, words)
 
 

@@ -265,7 +265,7 @@ def _known_trial(config: LoopConfig, before: Before) -> Moves:
     kick, step = KICK_OF_ROOM * _room(config, before.mv), config.sp_deviation
     what = (
         f"Only where operation has shown the plant well enough: the set-point is stepped {_first(config)} by up to "
-        f"{step:g} {config.pv_unit} under the gains that follow from it, on trial, and home where the record is not "
+        f"{step:g} {config.pv_unit} under the gains that follow from it, on trial, and back where the record is not "
         f"conclusive. A plant that is another one by now shows in it; the present gains then take over again."
         f"{_ramp(config, step)}"
     )
@@ -327,7 +327,7 @@ def _five_stage(stage: str, config: LoopConfig, request: FiveStages, before: Bef
         )
         return Moves(stage, what, kick, kick, step)
     if gains is not None and gains.Kp > 0.0:
-        step = min(step, kick / gains.Kp)  # `allowed_step` of the old gains bounds both steps
+        step = min(step, kick / gains.Kp)  # `allowed_step` of the previous gains bounds both steps
     which = "present" if stage == "baseline" else "new"
     what = f"The set-point is stepped up by up to {step:.4g} {unit} under the {which} gains, and back."
     return Moves(stage, what, kick, kick, step)

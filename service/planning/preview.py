@@ -315,10 +315,10 @@ def _on_abort(request: RetuneRequest, state: LoopState | None, unit: str, ramped
     if request.dry_run:
         return "Nothing on the loop has changed."
     silent = ""
-    if state is not None and state.when_silent:
-        silent = f" If the controller itself falls silent, the plant's I/O {state.when_silent}."
+    if state is not None and state.fail_action:
+        silent = f" If the controller itself fails, the plant's I/O {state.fail_action}."
     by_itself = "The controller does that by itself also when the service or the bus fails."
-    at_once = " Where a test is cut short the set-point goes home at once, not by a ramp." if ramped else ""
+    at_once = " Where a test is cut short the set-point returns at once, not by a ramp." if ramped else ""
     return f"{_home(state, unit)} {by_itself}{at_once}{_on_false_pv(state)}{silent}"
 
 
@@ -428,7 +428,7 @@ def _rounded(value: float) -> float:
 
 
 class FleetPreview(BaseModel):
-    """What a retune of many loops would do, from configuration and earlier jobs; no controller is asked."""
+    """What a batch would do, from configuration and earlier jobs; no controller is asked."""
 
     count: int = Field(description="Number of loops", examples=[40])
     would_start: int = Field(description="Number of loops that would start, as far as is known", examples=[38])

@@ -60,9 +60,7 @@ def make_jobs(
         machine,
         registry,
         {
-            What.ACCEPT: lambda asked: decisions.accept(
-                asked.job_id or "", asked.by, asked.roll_back_by_itself is not False
-            ),
+            What.ACCEPT: lambda asked: decisions.accept(asked.job_id or "", asked.by, asked.auto_rollback is not False),
             What.ROLLBACK: lambda asked: decisions.rollback(asked.job_id or "", asked.by),
             What.WRITES_OVER: lambda asked: locking.wait_for_writes(asked.loop),
         },

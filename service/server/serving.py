@@ -215,7 +215,9 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
     site = load_site(setup.loops_file)
     site.check_own_node(setup.node, str(setup.loops_file))
     if setup.database is not None and setup.host is None:
-        raise BadDatabase("a shared database needs --host NAME: what this host is called among the others, for ever")
+        raise BadDatabase(
+            "a shared database needs --gateway NAME: what this gateway is called among the others, for ever"
+        )
     local = is_loopback(setup.bind)
     if setup.auth is False and not local:
         raise NotSafe(f"without keys only this machine is served: leave out --no-auth, or --bind {setup.bind}")

@@ -51,15 +51,15 @@ class Trouble(_Kept):
     """What went wrong under the accepted gains.
 
     at: when it was seen: UTC, ISO 8601. text: in words, with the numbers.
-    put_back: whether the old gains were put back for it by the watch; None: that is not decided yet.
-    why_not: why they were not, in words; None: they were, or it is not decided yet.
+    rolled_back: whether the previous gains were put back for it by the watch; None: that is not decided yet.
+    reason: why they were not, in words; None: they were, or it is not decided yet.
     """
 
     kind: TroubleKind
     at: str
     text: str
-    put_back: bool | None = None
-    why_not: str | None = None
+    rolled_back: bool | None = None
+    reason: str | None = None
 
 
 class AcceptanceWatch(_Kept):
@@ -67,13 +67,13 @@ class AcceptanceWatch(_Kept):
 
     since: when the gains were accepted, or a clock was set back behind that: UTC, ISO 8601. by: who has accepted them.
     latest_job: the latest job of the loop as they were accepted.
-    roll_back_by_itself: whether the old gains are to be put back where something goes wrong.
+    auto_rollback: whether the previous gains are to be put back where something goes wrong.
     inside: whether PV was within its limits since then: one that never was does not leave them.
-    disarmed: why they are not put back any more, in words; None: they are, if that was asked for.
+    auto_rollback_off: why they are not put back any more, in words; None: they are, if that was asked for.
     period_s: the ultimate period of the model, s.
     model: why the loop is compared with no model, in words; None: it is compared.
     changes: those that were compared, oldest first. looked_to_s: up to when changes were looked for, wall time, s.
-    not_heard: why the loop is not heard at present, in words; None: it is.
+    no_data: why the loop is not heard at present, in words; None: it is.
     trouble: what went wrong; None: nothing.
     end, ended_at: why and when it ended; None: it goes on.
     """
@@ -81,14 +81,14 @@ class AcceptanceWatch(_Kept):
     since: str
     by: str
     latest_job: str | None = None
-    roll_back_by_itself: bool
+    auto_rollback: bool
     period_s: float
     model: str | None = None
     inside: bool = False
-    disarmed: str | None = None
+    auto_rollback_off: str | None = None
     changes: tuple[WatchedChange, ...] = ()
     looked_to_s: float = 0.0
-    not_heard: str | None = None
+    no_data: str | None = None
     trouble: Trouble | None = None
     end: WatchEnd | None = None
     ended_at: str | None = None
@@ -100,8 +100,8 @@ class AcceptanceWatch(_Kept):
 
     @property
     def armed(self) -> bool:
-        """Whether the old gains are put back by itself where something goes wrong now."""
-        return self.roll_back_by_itself and self.disarmed is None and self.end is None and self.trouble is None
+        """Whether the previous gains are put back automatically where something goes wrong now."""
+        return self.auto_rollback and self.auto_rollback_off is None and self.end is None and self.trouble is None
 
     @property
     def informative(self) -> int:
@@ -113,23 +113,23 @@ class AcceptanceWatch(_Kept):
         return conclusion_of([each.compared for each in self.changes])
 
     @property
-    def abnormal(self) -> bool:
+    def alarm(self) -> bool:
         """Whether an alarm is to be made of what was found. Who has rolled back has seen it; what the watch has rolled
         back by itself nobody has seen yet."""
-        if self.trouble is not None and self.trouble.put_back:
+        if self.trouble is not None and self.trouble.rolled_back:
             return True
         found = self.trouble is not None or self.conclusion().state is ModelState.MISMATCH
         return found and self.end is not WatchEnd.ROLLED_BACK
 
     @property
-    def words(self) -> str:
+    def message(self) -> str:
         """What the watch has come to, in a sentence or two."""
         found = self.conclusion()
         parts = [_words_of(found, self)]
         if self.trouble is not None:
             parts.append(_words_of_trouble(self.trouble))
-        if self.not_heard is not None and self.end is None:
-            parts.append(f"The loop is not heard: {self.not_heard}.")
+        if self.no_data is not None and self.end is None:
+            parts.append(f"No data of the loop: {self.no_data}.")
         return " ".join(parts)
 
 
@@ -174,8 +174,8 @@ def instead_in_words(found: OtherPlant) -> str:
 
 
 def _words_of_trouble(trouble: Trouble) -> str:
-    if trouble.put_back:
-        return f"{trouble.text}: the old gains were put back."
-    if trouble.why_not is None:
+    if trouble.rolled_back:
+        return f"{trouble.text}: the previous gains were put back."
+    if trouble.reason is None:
         return f"{trouble.text}."
-    return f"{trouble.text}. The old gains were not put back: {trouble.why_not}."
+    return f"{trouble.text}. The previous gains were not put back: {trouble.reason}."

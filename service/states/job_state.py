@@ -61,9 +61,3 @@ def state_after(ended: Ended) -> JobState:
     if isinstance(ended, Refused):
         return JobState.REFUSED
     return JobState.ABORTED if isinstance(ended, Aborted) else JobState.FAILED
-
-
-def shown(state: str, dry_run: bool) -> JobState:
-    """The state of a stored job: dry runs of earlier versions ended as proposals."""
-    stored = JobState(state)
-    return JobState.REHEARSED if dry_run and stored is JobState.PROPOSED else stored

@@ -22,7 +22,7 @@ class LoopState:
 
     gains: of a live loop the accepted ones, those that a trial ends with.
     node_state: operational, or the state in which a node of the loop controls nothing.
-    when_silent: what the plant's I/O does when the controller falls silent ("holds MV where it is"); empty: not known.
+    fail_action: what the plant's I/O does when the controller falls silent ("holds MV where it is"); empty: not known.
     """
 
     mode: Mode
@@ -37,7 +37,7 @@ class LoopState:
     reverse_acting: bool
     manual_output: float = 0.0
     node_state: str = OPERATIONAL
-    when_silent: str = ""
+    fail_action: str = ""
 
     @property
     def held_mv(self) -> float:
@@ -86,7 +86,7 @@ _LOOP_STATE = TypeAdapter(LoopState)
 def gains_of(data: JsonValue) -> Gains:
     """Returns the gains in the JSON of a job. Raises Conflict where there are none."""
     if not data or not isinstance(data, dict):
-        raise Conflict("the job has kept no old gains, so that none can be written or taken back; retune the loop")
+        raise Conflict("the job has kept no previous gains, so that none can be written or taken back; retune the loop")
     return Gains(**{name: number(data[name]) for name in Gains.__dataclass_fields__ if data.get(name) is not None})
 
 

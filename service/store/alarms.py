@@ -1,4 +1,4 @@
-"""What the database tells of alarms: tests whose loop was not confirmed to be as before, and what was signed off."""
+"""What the database tells of alarms: tests whose loop was not confirmed to be as before, and what was acknowledged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from loopwright.service.store import audit, claims
 from loopwright.service.store.clock import now
 from loopwright.service.store.false_pv import FALSE_PV, not_acknowledged
 from loopwright.service.store.store import Store
-from loopwright.service.store.tables import AlarmSignOffRow, JobRow
+from loopwright.service.store.tables import AlarmAcknowledgementRow, JobRow
 from loopwright.tuning.reasons import Reason
 
 NOT_RESTORED = "not_restored"
@@ -24,16 +24,16 @@ NOT_RESTORED_TEXT = "Not confirmed that the loop is as before the test"
 _TEXTS = {NOT_RESTORED: NOT_RESTORED_TEXT, FALSE_PV: "The test found PV to be false"}
 
 
-class SignedOffAlready(Exception):
-    """Somebody has signed the alarm off before."""
+class AlreadyAcknowledged(Exception):
+    """Somebody has acknowledged the alarm before."""
 
-    def __init__(self, row: AlarmSignOffRow) -> None:
-        super().__init__(f"alarm {row.alarm_id} was signed off by {row.by} at {row.at}: {row.text}")
+    def __init__(self, row: AlarmAcknowledgementRow) -> None:
+        super().__init__(f"alarm {row.alarm_id} was acknowledged by {row.by} at {row.at}: {row.text}")
 
 
 @dataclass(frozen=True, slots=True)
 class FalsePvJob:
-    """A test that has found PV to be false, which nobody has signed off.
+    """A test that has found PV to be false, which nobody has acknowledged.
 
     at: when it ended: UTC, ISO 8601.
     restored: the loop as read back; None: it was not.
@@ -49,10 +49,10 @@ class FalsePvJob:
 
 @dataclass(frozen=True, slots=True)
 class UnconfirmedJob:
-    """A test at whose end the loop was not confirmed to be as before, and that nobody has signed off.
+    """A test at whose end the loop was not confirmed to be as before, and that nobody has acknowledged.
 
     at: when it ended: UTC, ISO 8601.
-    looked_after: whether the loop is still looked at until it is as before.
+    monitored: whether the loop is still looked at until it is as before.
     """
 
     id: str
@@ -60,7 +60,7 @@ class UnconfirmedJob:
     host: str
     at: str
     reason: Reason | None
-    looked_after: bool
+    monitored: bool
 
 
 def alarm_id(*parts: str) -> str:
@@ -70,16 +70,16 @@ def alarm_id(*parts: str) -> str:
 
 def unconfirmed(store: Store) -> list[UnconfirmedJob]:
     """Returns those of every host, oldest first. Raises SQLAlchemyError."""
-    signed = select(AlarmSignOffRow.job_id).where(
-        AlarmSignOffRow.job_id == JobRow.id, AlarmSignOffRow.kind == NOT_RESTORED
+    signed = select(AlarmAcknowledgementRow.job_id).where(
+        AlarmAcknowledgementRow.job_id == JobRow.id, AlarmAcknowledgementRow.kind == NOT_RESTORED
     )
     wanted = (
         select(
             JobRow.id, JobRow.loop, JobRow.host, func.coalesce(JobRow.ended_at, JobRow.created_at), JobRow.reason,
-            JobRow.look_after,
+            JobRow.restore_unconfirmed,
         )
         .where(
-            or_(JobRow.reason == Reason.RESTORE_UNCONFIRMED, JobRow.look_after.is_(True)),
+            or_(JobRow.reason == Reason.RESTORE_UNCONFIRMED, JobRow.restore_unconfirmed.is_(True)),
             JobRow.dry_run.is_(False),
             ~signed.exists(),
         )
@@ -98,54 +98,56 @@ def false_pvs(store: Store) -> list[FalsePvJob]:
         ]
 
 
-def signed_off(store: Store, alarms: Collection[str]) -> frozenset[str]:
-    """Returns which of these alarms were signed off. Raises SQLAlchemyError."""
+def acknowledged(store: Store, alarms: Collection[str]) -> frozenset[str]:
+    """Returns which of these alarms were acknowledged. Raises SQLAlchemyError."""
     with store.reading() as session:
-        wanted = select(AlarmSignOffRow.alarm_id).where(AlarmSignOffRow.alarm_id.in_(alarms))
+        wanted = select(AlarmAcknowledgementRow.alarm_id).where(AlarmAcknowledgementRow.alarm_id.in_(alarms))
         return frozenset(session.scalars(wanted))
 
 
-def find(store: Store, wanted: str) -> AlarmSignOffRow | None:
-    """Returns an alarm that was signed off; None: it was not."""
+def find(store: Store, wanted: str) -> AlarmAcknowledgementRow | None:
+    """Returns an alarm that was acknowledged; None: it was not."""
     with store.reading() as session:
-        return session.get(AlarmSignOffRow, wanted)
+        return session.get(AlarmAcknowledgementRow, wanted)
 
 
-def sign_off(store: Store, row: AlarmSignOffRow) -> AlarmSignOffRow:
-    """Stores that an alarm is signed off, with its entry in the audit log. Raises SignedOffAlready."""
+def acknowledge(store: Store, row: AlarmAcknowledgementRow) -> AlarmAcknowledgementRow:
+    """Stores that an alarm is acknowledged, with its entry in the audit log. Raises AlreadyAcknowledged."""
     try:
         with store.writing() as session:
-            earlier = session.get(AlarmSignOffRow, row.alarm_id)
+            earlier = session.get(AlarmAcknowledgementRow, row.alarm_id)
             if earlier is not None:
-                raise SignedOffAlready(earlier)
+                raise AlreadyAcknowledged(earlier)
             _add(session, row)
             claims.changed(session, f"/alarms/{row.alarm_id}")
     except IntegrityError:  # another gateway was faster by a moment
         faster = find(store, row.alarm_id)
         if faster is None:
             raise
-        raise SignedOffAlready(faster) from None
+        raise AlreadyAcknowledged(faster) from None
     return row
 
 
-def signed_off_with(session: Session, job: JobRow, kind: str, by: str) -> None:
-    """Signs an alarm off within a transaction in which a person answers for the loop, unless it was before.
+def acknowledged_with(session: Session, job: JobRow, kind: str, by: str) -> None:
+    """Acknowledges an alarm within a transaction in which a person answers for the loop, unless it was before.
 
     kind: NOT_RESTORED, FALSE_PV.
     """
-    of_it = select(AlarmSignOffRow).where(AlarmSignOffRow.job_id == job.id, AlarmSignOffRow.kind == kind)
+    of_it = select(AlarmAcknowledgementRow).where(
+        AlarmAcknowledgementRow.job_id == job.id, AlarmAcknowledgementRow.kind == kind
+    )
     if session.scalars(of_it).first() is None:
         _add(
             session,
-            AlarmSignOffRow(
-                alarm_id=alarm_id(kind, job.id), level=1, kind=kind, host=job.host, loop=job.loop, job_id=job.id,
+            AlarmAcknowledgementRow(
+                alarm_id=alarm_id(kind, job.id), priority=1, kind=kind, host=job.host, loop=job.loop, job_id=job.id,
                 text=_TEXTS[kind], since=job.ended_at or job.created_at, by=by, at=now(),
             ),
         )  # fmt: skip
 
 
-def _add(session: Session, row: AlarmSignOffRow) -> None:
+def _add(session: Session, row: AlarmAcknowledgementRow) -> None:
     session.add(row)
     session.flush()
-    before = {"level": row.level, "kind": row.kind, "text": row.text, "since": row.since, "job": row.job_id}
-    audit.record(session, "alarm_sign_off", row.alarm_id, before=before, loop=row.loop, said_by=row.by)
+    before = {"priority": row.priority, "kind": row.kind, "text": row.text, "since": row.since, "job": row.job_id}
+    audit.record(session, "acknowledge_alarm", row.alarm_id, before=before, loop=row.loop, by=row.by)

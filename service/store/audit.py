@@ -20,7 +20,7 @@ def record(
     before: Mapping[str, object] | None = None,
     after: Mapping[str, object] | None = None,
     loop: str | None = None,
-    said_by: str | None = None,
+    by: str | None = None,
     at: str | None = None,
 ) -> None:
     """Adds a row for the present principal. what: retune, abort, accept, rollback, key_create, ...; subject: the id of
@@ -28,7 +28,7 @@ def record(
     who = current.get()
     session.add(
         AuditRow(
-            at=at or now(), who=who.name, key_id=who.key_id, address=who.address, gateway=who.gateway, said_by=said_by,
+            at=at or now(), key=who.name, key_id=who.key_id, address=who.address, gateway=who.gateway, by=by,
             what=what, subject=subject, loop=loop, before=before, after=after,
         )
     )  # fmt: skip
@@ -61,7 +61,7 @@ def trail(
     if loop is not None:
         wanted = wanted.where(AuditRow.loop == loop)
     if who is not None:
-        wanted = wanted.where(or_(AuditRow.who == who, AuditRow.said_by == who))
+        wanted = wanted.where(or_(AuditRow.key == who, AuditRow.by == who))
     if from_at is not None:
         wanted = wanted.where(AuditRow.at >= from_at)
     with Session(engine) as session:

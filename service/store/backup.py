@@ -14,7 +14,7 @@ from alembic.config import Config
 from alembic.script import ScriptDirectory
 
 from loopwright.protocol.durable import put_in_place, sync
-from loopwright.service.store.database import FILE
+from loopwright.service.store.database import FILE, never_released
 from loopwright.service.store.lock import LOCK, FolderLock
 from loopwright.service.store.store import Store
 
@@ -109,6 +109,8 @@ def _check(path: Path) -> None:
         raise BackupProblem(f"{path} is not a back-up of Loopwright: {error}") from error
     if wrong:
         raise BackupProblem(f"{path} is damaged: {'; '.join(wrong)}")
+    if (refused := never_released(str(revision[0]) if revision else None)) is not None:
+        raise BackupProblem(f"{path} {refused}")
     config = Config()
     config.set_main_option("script_location", "loopwright.service.store:migrations")
     known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import sqlite3
+from contextlib import closing
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ ENGINE_FILE = "engine.sqlite"
 WAIT_S = 5
 """Wall time for a connection, a lock or a locked file."""
 STATEMENT_S = 10
+FIRST_REVISION = "0100"
+"""The revision of the first release; those before it, of which no data are kept anywhere, are not read."""
 _MIGRATING = 0x4C6F6F70  # any number that hosts agree on
 
 
@@ -121,9 +124,13 @@ def checkpoint(engine: Engine) -> None:
 
 
 def migrate(engine: Engine) -> None:
-    """Makes the tables, or brings them to the present revision. Raises BadDatabase when they are of a later one."""
-    if revision(engine) == present_revision():
+    """Makes the tables, or brings them to the present revision. Raises BadDatabase, with nothing written, when they are
+    of a later one or of one from before the first release."""
+    found = revision(engine)
+    if found == present_revision():
         return
+    if (refused := never_released(found)) is not None:
+        raise BadDatabase(f"the database {refused}")
     from alembic import command  # 0.1 s of processor time, which no start on a present database pays
     from alembic.config import Config
     from alembic.util import CommandError
@@ -150,12 +157,42 @@ def present_revision() -> str:
     return max(file.name[1:5] for file in (Path(__file__).parent / "migrations" / "versions").glob("m*.py"))
 
 
+def never_released(found: str | None) -> str | None:
+    """Returns what is to be done about tables of a revision from before the first release, as the predicate of a
+    sentence; None of any other revision."""
+    if found is None or found >= FIRST_REVISION:
+        return None
+    return (
+        f"was made by a version of Loopwright from before 0.1.0 (revision {found}), which this version does not read "
+        "and has left as it was: keep it aside, and start with a new data folder or an empty database "
+        "(docs/operations.md)"
+    )
+
+
 def revision(engine: Engine) -> str | None:
-    """Returns the revision of the tables; None where there are none."""
+    """Returns the revision of the tables; None where there are none. A file is opened to be read only: what is refused
+    is left as it was."""
+    if engine.dialect.name == "sqlite" and engine.url.database:
+        try:
+            return revision_of(Path(engine.url.database))
+        except sqlite3.Error:
+            pass  # asked again below, by those who know what to say of a file that cannot be read
     with engine.connect() as connection:
         if not inspect(connection).has_table("alembic_version"):
             return None
         return connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
+
+
+def revision_of(file: Path) -> str | None:
+    """Returns the revision of the tables in a file, which is opened to be read only; None where there are none. Raises
+    sqlite3.Error."""
+    if not file.exists():
+        return None
+    with closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True, timeout=float(WAIT_S))) as opened:
+        if opened.execute("SELECT count(*) FROM sqlite_master WHERE name = 'alembic_version'").fetchone() == (0,):
+            return None
+        row = opened.execute("SELECT version_num FROM alembic_version").fetchone()
+        return None if row is None else str(row[0])
 
 
 def pragmas(connection: sqlite3.Connection, _record: object) -> None:

@@ -91,7 +91,7 @@ class DecisionRequest:
 
     job_id: None for one that is about a loop alone.  by: who, as given in the request.  asked_s: when, seconds since
     1970 UTC.  asked_at: at which gateway.  host: the gateway that carries it out.
-    roll_back_by_itself: of an acceptance, whether the old gains are put back where something goes wrong.
+    auto_rollback: of an acceptance, whether the previous gains are put back where something goes wrong.
     """
 
     number: int
@@ -106,7 +106,7 @@ class DecisionRequest:
     answer: RequestAnswer | None
     who: JsonObject
     claim: Claim | None
-    roll_back_by_itself: bool | None
+    auto_rollback: bool | None
 
     @classmethod
     def of(cls, row: Row, now_s: float) -> DecisionRequest:
@@ -129,7 +129,7 @@ class DecisionRequest:
             answer=None if row.answer is None else RequestAnswer.model_validate(row.answer),
             who=row.who,
             claim=claim,
-            roll_back_by_itself=row.roll_back_by_itself,
+            auto_rollback=row.auto_rollback,
         )
 
     @property
@@ -155,7 +155,7 @@ def ask(
     loop: str,
     job_id: str | None,
     by: str,
-    roll_back_by_itself: bool | None = None,
+    auto_rollback: bool | None = None,
 ) -> int:
     """Stores a request of the present caller for the gateway `host`; returns its number. One that came with the same
     Idempotency-Key and is still open is taken over. Raises SQLAlchemyError, FolderInUse."""
@@ -175,7 +175,7 @@ def ask(
         now_s = _now_s(session)
         row = Row(
             host=host, asked_at=store.host, asked_s=now_s, expires_s=now_s + EXPIRES_S, what=what.value, loop=loop,
-            job_id=job_id, by=by, state=RequestState.WAITING.value, roll_back_by_itself=roll_back_by_itself,
+            job_id=job_id, by=by, state=RequestState.WAITING.value, auto_rollback=auto_rollback,
             who=json_object(
                 {"name": who.name, "scope": who.scope.value, "key_id": who.key_id, "address": who.address}
             ),

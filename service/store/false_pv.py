@@ -1,5 +1,5 @@
 """The tests that have found PV to be false: no other begins on the loop until a person has acknowledged it, which is to
-sign off its alarm.
+acknowledge its alarm.
 
 A loop that was in automatic is in manual since, and nothing of ours takes it back. The column is `JobRow.false_pv`.
 """
@@ -12,7 +12,7 @@ from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
 from loopwright.service.errors import NotAcknowledged
-from loopwright.service.store.tables import AlarmSignOffRow, JobRow
+from loopwright.service.store.tables import AlarmAcknowledgementRow, JobRow
 
 FALSE_PV = "false_pv"
 """The kind of its alarm."""
@@ -37,10 +37,12 @@ def words(job: JobRow) -> str:
     """Returns what was found, and how it is acknowledged."""
     return (
         f"job {job.id} found PV of loop {job.loop} to be false at {job.ended_at}, and nobody has acknowledged that: "
-        f"check the sensor and the loop's mode, then sign the alarm off, or: loopwright dismiss {job.loop}"
+        f"check the sensor and the loop's mode, then acknowledge the alarm, or: loopwright acknowledge {job.loop}"
     )
 
 
 def _not_acknowledged() -> Select[JobRow]:
-    signed = select(AlarmSignOffRow.job_id).where(AlarmSignOffRow.job_id == JobRow.id, AlarmSignOffRow.kind == FALSE_PV)
+    signed = select(AlarmAcknowledgementRow.job_id).where(
+        AlarmAcknowledgementRow.job_id == JobRow.id, AlarmAcknowledgementRow.kind == FALSE_PV
+    )
     return select(JobRow).where(JobRow.false_pv.is_(True), ~signed.exists()).order_by(JobRow.number)

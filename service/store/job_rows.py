@@ -9,7 +9,7 @@ from sqlalchemy import func, insert, select
 from sqlalchemy.orm import Session
 
 from loopwright.service.jsonable import JsonObject, json_object, to_jsonable
-from loopwright.service.states.job_state import ACTIVE, MOVES, JobState, shown
+from loopwright.service.states.job_state import ACTIVE, MOVES, JobState
 from loopwright.service.states.loop_state import gains_of, same_gains
 from loopwright.service.store import audit, claims, false_pv, late, loop_locks
 from loopwright.service.store.clock import now
@@ -21,7 +21,7 @@ DECISIONS = {JobState.ACCEPTED: "accept", JobState.ROLLED_BACK: "rollback"}
 """What the audit log calls the moves that somebody decides."""
 BEGUN = "decision_begun"
 """The event that a decision writes before it writes to the controller: only without it is a proposal known to have
-left the old gains in effect. Its decision is `unknown` where the database may be older than the last decision."""
+left the previous gains in effect. Its decision is `unknown` where the database may be older than the last decision."""
 _LOCKED = "jobs whose rows are locked"
 _CUT_SHORT = (JobState.ABORTED, JobState.FAILED)
 """Ends of a job that was told to stop; `failed` where its loop could not be restored."""
@@ -56,7 +56,7 @@ def set_columns(row: JobRow, columns: JobColumns) -> None:
 
 def check(session: Session, row: JobRow, wanted: JobState) -> None:
     """Raises IllegalMove, with words for who asks for it, unless the job may become so."""
-    present = shown(row.state, row.dry_run)
+    present = row.state
     if wanted not in MOVES[present]:
         raise late.too_late(row, present, wanted, decided(session, row))
 
@@ -116,7 +116,7 @@ def note_stop(session: Session, job_id: str, reason: Reason, by: str, heard: boo
         row.stop_reason = reason
         append(session, job_id, "abort_requested", {"by": by}, row.plant_time_s, at)
         before = row.state if row.state in ACTIVE else JobState.RUNNING
-        audit.record(session, "abort", job_id, before={"state": before}, loop=row.loop, said_by=by, at=at)
+        audit.record(session, "abort", job_id, before={"state": before}, loop=row.loop, by=by, at=at)
     return row
 
 
@@ -148,7 +148,7 @@ def _audit_decision(
 ) -> None:
     """held: the gains read back after the decision, where it went to the controller."""
     proposed = None if row.result is None else row.result.new_gains
-    old, new = row.old_gains, None if proposed is None else asdict(proposed.gains())
+    old, new = row.previous_gains, None if proposed is None else asdict(proposed.gains())
     has = new if wanted is JobState.ACCEPTED else old
     # A rollback that had to write found the new gains, of an acceptance that had ended in an error too.
     had = new if wanted is JobState.ROLLED_BACK and last_begun(session, row.id) == DECISIONS[wanted] else old
@@ -161,5 +161,5 @@ def _audit_decision(
         before={"state": previous.value, "gains": had},
         after={"state": wanted.value, "gains": has},
         loop=row.loop,
-        said_by=by,
+        by=by,
     )

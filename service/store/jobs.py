@@ -25,8 +25,8 @@ class JobColumns(TypedDict, total=False):
     detail: str
     false_pv: bool
     found: Mapping[str, object]
-    look_after: bool
-    old_gains: Mapping[str, object]
+    restore_unconfirmed: bool
+    previous_gains: Mapping[str, object]
     plant_time_s: float
     reason: str
     restored: Mapping[str, object]
@@ -50,7 +50,7 @@ class Job:
     state: JobState
     dry_run: bool
     request: JsonObject
-    requested_by: str
+    by: str
     created_at: str
     started_at: str | None
     ended_at: str | None
@@ -59,7 +59,7 @@ class Job:
     stage_times_s: dict[str, float] | None
     reason: Reason | None
     detail: str | None
-    old_gains: JsonObject | None
+    previous_gains: JsonObject | None
     restored: JsonObject | None
     result: FastResult | FiveStageResult | None
     host: str
@@ -67,7 +67,7 @@ class Job:
     attempt: int
     found: JsonObject | None
     session: int | None
-    look_after: bool
+    restore_unconfirmed: bool
     false_pv: bool
     stop_reason: Reason | None
 

@@ -17,18 +17,18 @@ MAX_OF_A_LOOP = 20
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """A finding as stored. older_plant: why it is of an older plant, in words; None where it is not."""
+    """A finding as stored. superseded: why it is of an older plant, in words; None where it is not."""
 
     number: int
     finding: Finding
-    older_plant: str | None
+    superseded: str | None
 
 
 def read(store: Store, loop: str) -> list[Known]:
     """Returns the findings of a loop of any host, oldest first."""
     wanted = select(KnowledgeRow).where(KnowledgeRow.loop == loop).order_by(KnowledgeRow.number)
     with store.reading() as session:
-        return [Known(row.number, row.finding, row.older_plant) for row in session.scalars(wanted)]
+        return [Known(row.number, row.finding, row.superseded) for row in session.scalars(wanted)]
 
 
 def add(
@@ -49,7 +49,7 @@ def add(
     with store.writing() as session:
         session.execute(delete(KnowledgeRow).where(of_loop, KnowledgeRow.number.in_(instead_of)))
         for number, why in older.items():
-            session.execute(update(KnowledgeRow).where(KnowledgeRow.number == number).values(older_plant=why))
+            session.execute(update(KnowledgeRow).where(KnowledgeRow.number == number).values(superseded=why))
         session.add(KnowledgeRow(loop=loop, at=finding.at, finding=finding))
         session.flush()
         latest = select(KnowledgeRow.number).where(of_loop).order_by(KnowledgeRow.number.desc()).limit(MAX_OF_A_LOOP)
@@ -61,7 +61,7 @@ def mark_older(store: Store, older: Mapping[int, str]) -> None:
     """Stores that findings are of an older plant. older: the reasons, by number."""
     with store.writing() as session:
         for number, why in older.items():
-            session.execute(update(KnowledgeRow).where(KnowledgeRow.number == number).values(older_plant=why))
+            session.execute(update(KnowledgeRow).where(KnowledgeRow.number == number).values(superseded=why))
 
 
 def delete_older(store: Store, before: str) -> int:

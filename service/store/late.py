@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from loopwright.service.states.job_state import ACTIVE, IllegalMove, JobState
 from loopwright.service.store.tables import JobRow
 
-_GO_BACK = "To go back to the old gains, roll it back"
+_GO_BACK = "To go back to the previous gains, roll it back"
 _NO_GAINS = {
     JobState.NO_GAIN: "it proposes no gains, because the loop is already tuned as well as asked. For a proposal all "
     "the same, retune the loop with propose_anyway",
@@ -55,7 +55,7 @@ def too_late(job: JobRow, now: JobState, wanted: JobState, decided: Decided | No
 
 
 def _who(job: JobRow) -> str:
-    return f"job {job.id} of {job.requested_by}"
+    return f"job {job.id} of {job.by}"
 
 
 def _how_far(job: JobRow) -> str:

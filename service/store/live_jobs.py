@@ -32,7 +32,7 @@ class JobInBrief:
     host: str
     state: JobState
     dry_run: bool
-    requested_by: str
+    by: str
     stage: str | None
     plant_time_s: float
     stopping: bool
@@ -42,18 +42,18 @@ class JobInBrief:
 
 @dataclass(frozen=True, slots=True)
 class Acceptance:
-    """Gains that were accepted. at: UTC, ISO 8601.  by: as given in the request.  ms: the Ms asked for; None: the
+    """Gains that were accepted. at: UTC, ISO 8601.  by: as given in the request.  Ms: the value asked for; None: the
     method has none."""
 
     job_id: str
     at: str
     by: str
     gains: Gains
-    ms: float | None
+    Ms: float | None
 
 
 _BRIEF = select(
-    JobRow.id, JobRow.loop, JobRow.host, JobRow.state, JobRow.dry_run, JobRow.requested_by, JobRow.stage,
+    JobRow.id, JobRow.loop, JobRow.host, JobRow.state, JobRow.dry_run, JobRow.by, JobRow.stage,
     JobRow.plant_time_s, JobRow.stop_reason.is_not(None), JobRow.reason,
     func.coalesce(JobRow.ended_at, JobRow.started_at, JobRow.created_at),
 )  # fmt: skip
@@ -104,9 +104,9 @@ def acceptances(store: Store, loop: str | None = None) -> dict[str, Acceptance]:
     with store.reading() as session:
         for row in session.execute(wanted):
             if row.data.get("state") == JobState.ACCEPTED and row.result is not None and row.result.new_gains:
-                ms = row.result.chosen.get("Ms")
+                Ms = row.result.design.get("Ms")
                 by = str(row.data.get("by", ""))
-                found[row.loop] = Acceptance(row.id, row.at, by, row.result.new_gains.gains(), ms)
+                found[row.loop] = Acceptance(row.id, row.at, by, row.result.new_gains.gains(), Ms)
     return found
 
 

@@ -22,7 +22,7 @@ def lock(session: Session, loop: str, reason: str, by: str) -> LoopLockRow:
     if row is None:
         row = LoopLockRow(loop=loop, reason=reason, by=by, since=now())
         session.add(row)
-        audit.record(session, "lock", loop, after=_shown(row), loop=loop, said_by=by)
+        audit.record(session, "lock", loop, after=_shown(row), loop=loop, by=by)
     elif row.reason != reason:
         raise LockedOtherwise(words(row))
     return row
@@ -34,7 +34,7 @@ def unlock(session: Session, loop: str, by: str) -> LoopLockRow | None:
     row = session.get(LoopLockRow, loop)
     if row is not None:
         session.delete(row)
-        audit.record(session, "unlock", loop, before=_shown(row), loop=loop, said_by=by)
+        audit.record(session, "unlock", loop, before=_shown(row), loop=loop, by=by)
     return row
 
 

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from loopwright.service.jsonable import json_object
 from loopwright.service.states.job_state import ACTIVE, JobState
-from loopwright.service.store import audit, claims, job_rows, late, loop_locks, retunes, sample_blocks
+from loopwright.service.store import audit, batches, claims, job_rows, late, loop_locks, sample_blocks
 from loopwright.service.store.clock import now
 from loopwright.service.store.damage import Damage
 from loopwright.service.store.database import (
@@ -33,7 +33,7 @@ from loopwright.service.store.database import (
 from loopwright.service.store.events import events
 from loopwright.service.store.jobs import Job, JobColumns, JobEvent
 from loopwright.service.store.lock import FolderLock, HostLock, ourselves
-from loopwright.service.store.tables import ChunkRow, EventRow, HostRow, JobRow, LoopRow, RetuneRow
+from loopwright.service.store.tables import BatchRow, ChunkRow, EventRow, HostRow, JobRow, LoopRow
 from loopwright.tuning.plan import Sample
 from loopwright.tuning.reasons import Reason
 
@@ -105,7 +105,7 @@ class Store:
     def _adopt(self) -> None:
         """The one host of a data folder has everything in it."""
         with self.writing() as session:
-            for table in (JobRow, LoopRow, RetuneRow, HostRow):
+            for table in (JobRow, LoopRow, BatchRow, HostRow):
                 session.execute(update(table).where(table.host != self.host).values(host=self.host))
 
     def close(self) -> None:
@@ -163,7 +163,7 @@ class Store:
     def own_loops(self, loops: Mapping[str, Mapping[str, object]]) -> None:
         """These are the loops of this host from now on, by tag.
 
-        A loop of a host that is not running is taken over with its active job, and looked after here if it was there:
+        A loop of a host that is not running is taken over with its active job, and monitored here if it was there:
         its bus has moved. Raises ForeignLoop when the other host is running.
         """
         others_of = select(LoopRow).where(LoopRow.tag.in_(loops), LoopRow.host != self.host)
@@ -181,7 +181,7 @@ class Store:
             moved = [row.tag for row in foreign]
             session.execute(
                 update(JobRow)
-                .where(JobRow.loop.in_(moved), JobRow.state.in_(_ACTIVE) | JobRow.look_after.is_(True))
+                .where(JobRow.loop.in_(moved), JobRow.state.in_(_ACTIVE) | JobRow.restore_unconfirmed.is_(True))
                 .values(host=self.host)
             )
             session.execute(delete(LoopRow).where((LoopRow.host == self.host) | LoopRow.tag.in_(moved)))
@@ -206,7 +206,7 @@ class Store:
         self,
         loop: str,
         request: Mapping[str, object],
-        requested_by: str,
+        by: str,
         dry_run: bool,
         host: str | None = None,
         version: str = "0",
@@ -220,7 +220,7 @@ class Store:
             state=JobState.QUEUED,
             dry_run=dry_run,
             request=json_object(request),
-            requested_by=requested_by,
+            by=by,
             created_at=now(),
             host=host or self.host,
             version=version,
@@ -230,9 +230,9 @@ class Store:
                 job_rows.may_begin(session, row)
                 session.add(row)
                 session.flush()
-                job_rows.append(session, row.id, "state", {"state": row.state, "by": requested_by}, 0.0)
+                job_rows.append(session, row.id, "state", {"state": row.state, "by": by}, 0.0)
                 claims.made(session, f"/jobs/{row.id}")
-                audit.record(session, "retune", row.id, after=row.request, loop=loop, said_by=requested_by)
+                audit.record(session, "retune", row.id, after=row.request, loop=loop, by=by)
                 if also is not None:
                     also(session, row)
                 return Job.from_row(row)
@@ -288,7 +288,7 @@ class Store:
 
     def doubt_proposals(self, why: str) -> None:
         """Notes of the proposals of every host that a decision may have been made about them which is not in this
-        database: a rollback then reads the controller, and puts the old gains back where it holds the new ones."""
+        database: a rollback then reads the controller, and puts the previous gains back where it holds the new ones."""
         with self.writing() as session:
             job_rows.doubt_proposals(session, why)
 
@@ -316,9 +316,9 @@ class Store:
             return Job.from_row(job_rows.find(session, job_id))
 
     def retune_of(self, job_id: str) -> str | None:
-        """Id of the retune of many loops that has begun the job; None: there is none."""
+        """Id of the batch that has begun the job; None: there is none."""
         with self._session() as session:
-            return retunes.of_job(session, job_id)
+            return batches.of_job(session, job_id)
 
     def active(self, loop: str) -> Job | None:
         """The job that has the loop, if any."""
@@ -377,7 +377,7 @@ class Store:
             row = job_rows.find(session, job_id)
             what = f"{job_rows.DECISIONS[wanted]}_failed"
             audit.record(
-                session, what, job_id, before={"state": row.state}, after={"error": detail}, loop=row.loop, said_by=by
+                session, what, job_id, before={"state": row.state}, after={"error": detail}, loop=row.loop, by=by
             )
 
     def last_models(self, loop: str | None = None) -> dict[str, Job]:
@@ -450,10 +450,10 @@ class Store:
             self.move(row.id, JobState.INTERRUPTED, reason=Reason.SERVICE_STOPPED.value, detail=detail)
         with self.writing() as session:
             job_rows.doubt_proposals(session, f"the back-up {source} was restored")
-            for retune in retunes.unfinished(session, self.host):
+            for retune in batches.unfinished(session, self.host):
                 detail = f"was {retune.state} when the back-up was made that has now been restored"
-                retunes.stop(session, retune.id, retunes.StopReason.SERVICE_STOPPED, detail)
-                retunes.end(session, retune.id)
+                batches.stop(session, retune.id, batches.StopReason.SERVICE_STOPPED, detail)
+                batches.end(session, retune.id)
             audit.record(session, "restore", source, after={"interrupted": [row.id for row in active]})
         return len(active)
 

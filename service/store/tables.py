@@ -102,7 +102,7 @@ class JobRow(Base):
         Index("jobs_by_loop", "loop", "number"),
         Index("jobs_by_host", "host", "state"),
         Index("jobs_by_reason", "reason"),
-        Index("jobs_looked_after", "look_after"),
+        Index("jobs_restore_unconfirmed", "restore_unconfirmed"),
         Index("jobs_false_pv", "false_pv"),
     )
 
@@ -112,7 +112,7 @@ class JobRow(Base):
     state: Mapped[JobState] = mapped_column(EnumColumn(JobState))
     dry_run: Mapped[bool]
     request: Mapped[JsonObject]
-    requested_by: Mapped[str]
+    by: Mapped[str]
     created_at: Mapped[str]
     started_at: Mapped[str | None]
     ended_at: Mapped[str | None]
@@ -121,7 +121,7 @@ class JobRow(Base):
     stage_times_s: Mapped[dict[str, float] | None]
     reason: Mapped[Reason | None] = mapped_column(EnumColumn(Reason))
     detail: Mapped[str | None]
-    old_gains: Mapped[JsonObject | None]
+    previous_gains: Mapped[JsonObject | None]
     restored: Mapped[JsonObject | None]
     result: Mapped[FastResult | FiveStageResult | None] = mapped_column(ResultColumn)
     # The host that runs it, the version of the workflow it was started under, how often it was started.
@@ -133,8 +133,8 @@ class JobRow(Base):
     # The number of the session that was opened last, written down before it was: a later process can close it.
     session: Mapped[int | None] = mapped_column(BigInteger)
     # The loop was not read back as home: it is looked at until it is, or a person says otherwise.
-    look_after: Mapped[bool] = mapped_column(server_default=text("false"), default=False)
-    # The test has found PV to be false: no other begins on the loop until its alarm is signed off.
+    restore_unconfirmed: Mapped[bool] = mapped_column(server_default=text("false"), default=False)
+    # The test has found PV to be false: no other begins on the loop until its alarm is acknowledged.
     false_pv: Mapped[bool] = mapped_column(server_default=text("false"), default=False)
     # Why the job is to stop, once somebody wants it to: any host may write it, the job's own host acts.
     stop_reason: Mapped[Reason | None] = mapped_column(EnumColumn(Reason))
@@ -201,7 +201,7 @@ class DecisionRequestRow(Base):
     host: the gateway that carries it out.  asked_at: the gateway at which it was asked.
     asked_s, expires_s: seconds since 1970 UTC by the clock of the database; it is not begun after the second.
     who: the caller.  claim_...: the Idempotency-Key that the caller gave.
-    roll_back_by_itself: of an acceptance, whether the old gains are put back where something goes wrong; null: of
+    auto_rollback: of an acceptance, whether the previous gains are put back where something goes wrong; null: of
     another request.
     """
 
@@ -226,7 +226,7 @@ class DecisionRequestRow(Base):
     claim_token: Mapped[str | None]
     state: Mapped[str]
     answer: Mapped[JsonObject | None]
-    roll_back_by_itself: Mapped[bool | None]
+    auto_rollback: Mapped[bool | None]
 
 
 class EventRow(Base):
@@ -272,7 +272,7 @@ class HistoryRow(Base):
 
 
 class KnowledgeRow(Base):
-    """What a test or normal operation has shown of a loop. older_plant: why it is no longer true; null: it is."""
+    """What a test or normal operation has shown of a loop. superseded: why it is no longer true; null: it is."""
 
     __tablename__ = "loop_knowledge"
     __table_args__ = (Index("loop_knowledge_by_loop", "loop", "number"),)
@@ -281,7 +281,7 @@ class KnowledgeRow(Base):
     loop: Mapped[str]
     at: Mapped[str]
     finding: Mapped[Finding] = mapped_column(FindingColumn)
-    older_plant: Mapped[str | None]
+    superseded: Mapped[str | None]
 
 
 class JobKnowledgeRow(Base):
@@ -310,27 +310,27 @@ class JobFiguresRow(Base):
 
 
 class WatchRow(Base):
-    """The watch of a loop after the gains of a job were accepted. open: whether it goes on.  abnormal: whether an alarm
+    """The watch of a loop after the gains of a job were accepted. open: whether it goes on.  alarm: whether one
     is to be made of what it has found."""
 
     __tablename__ = "watches"
-    __table_args__ = (Index("watches_by_loop", "loop", "open"), Index("abnormal_watches", "abnormal"))
+    __table_args__ = (Index("watches_by_loop", "loop", "open"), Index("watches_with_alarm", "alarm"))
 
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), primary_key=True)
     loop: Mapped[str]
     open: Mapped[bool]
-    abnormal: Mapped[bool]
+    alarm: Mapped[bool]
     watch: Mapped[AcceptanceWatch] = mapped_column(WatchColumn)
 
 
-class AlarmSignOffRow(Base):
-    """An alarm that somebody has signed off, as it was shown then. job_id: the test it is about; null: about none."""
+class AlarmAcknowledgementRow(Base):
+    """An alarm that somebody has acknowledged, as it was shown then. job_id: the test it is about; null: about none."""
 
-    __tablename__ = "alarm_sign_offs"
-    __table_args__ = (Index("alarm_sign_offs_by_job", "job_id"),)
+    __tablename__ = "alarm_acknowledgements"
+    __table_args__ = (Index("alarm_acknowledgements_by_job", "job_id"),)
 
     alarm_id: Mapped[str] = mapped_column(primary_key=True)
-    level: Mapped[int]
+    priority: Mapped[int]
     kind: Mapped[str]
     host: Mapped[str]
     loop: Mapped[str | None]
@@ -365,18 +365,18 @@ class WebhookDeliveryRow(Base):
     error: Mapped[str | None]
 
 
-class RetuneRow(Base):
-    """A retune of many loops. Its host begins their jobs, whatever hosts these are on."""
+class BatchRow(Base):
+    """A batch. Its host begins their jobs, whatever hosts these are on."""
 
-    __tablename__ = "retunes"
-    __table_args__ = (Index("retunes_by_host", "host", "ended_at"),)
+    __tablename__ = "batches"
+    __table_args__ = (Index("batches_by_host", "host", "ended_at"),)
 
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
     id: Mapped[str] = mapped_column(unique=True)
     host: Mapped[str]
     state: Mapped[str]
     request: Mapped[JsonObject]
-    requested_by: Mapped[str]
+    by: Mapped[str]
     created_at: Mapped[str]
     ended_at: Mapped[str | None]
     # Why no more jobs are begun, and that in words.
@@ -384,13 +384,13 @@ class RetuneRow(Base):
     detail: Mapped[str | None]
 
 
-class RetuneLoopRow(Base):
+class BatchLoopRow(Base):
     """A loop of such a retune with its latest job. detail: why it will have none, or no other; reason: from the closed
     list."""
 
-    __tablename__ = "retune_loops"
+    __tablename__ = "batch_loops"
 
-    retune_id: Mapped[str] = mapped_column(ForeignKey("retunes.id"), primary_key=True)
+    batch_id: Mapped[str] = mapped_column(ForeignKey("batches.id"), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
     loop: Mapped[str]
     job_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id"))
@@ -439,7 +439,7 @@ class KeyRow(Base):
 
 
 class AuditRow(Base):
-    """One change. who: the key's name, `local` or `cli:USER`; said_by: what the request itself claimed.  gateway: at
+    """One change. key: the name of the key, `local` or `cli:USER`; by: who asked, as the request says.  gateway: at
     which gateway it was asked, where several share the database."""
 
     __tablename__ = "audit"
@@ -447,11 +447,11 @@ class AuditRow(Base):
 
     number: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
     at: Mapped[str]
-    who: Mapped[str]
+    key: Mapped[str]
     key_id: Mapped[str | None]
     address: Mapped[str | None]
     gateway: Mapped[str | None]
-    said_by: Mapped[str | None]
+    by: Mapped[str | None]
     what: Mapped[str]
     subject: Mapped[str]
     loop: Mapped[str | None]

@@ -16,8 +16,8 @@ from loopwright.service.store.tables import JobRow, LoopRow, WatchRow
 
 
 @dataclass(frozen=True, slots=True)
-class AbnormalWatch:
-    """A watch that has found something abnormal, with its job, loop and host."""
+class WatchWithAlarm:
+    """A watch that has found something of which an alarm is made, with its job, loop and host."""
 
     job_id: str
     loop: str
@@ -31,14 +31,14 @@ Change = Callable[[AcceptanceWatch], AcceptanceWatch]
 
 def begin(session: Session, job: JobRow, watch: AcceptanceWatch) -> None:
     """Stores a new watch in the transaction of the acceptance, and ends those of earlier acceptances of the loop."""
-    noticed = WatchRow.open.is_(True) | WatchRow.abnormal.is_(True)
+    noticed = WatchRow.open.is_(True) | WatchRow.alarm.is_(True)
     for row in session.scalars(select(WatchRow).where(WatchRow.loop == job.loop, noticed)):
         if row.open:
             _set(row, ended(row.watch, WatchEnd.RETUNED))
-        row.abnormal = False  # what was said of it is of gains that are no longer in effect
+        row.alarm = False  # what was said of it is of gains that are no longer in effect
     of_loop = select(JobRow.id).where(JobRow.loop == job.loop, JobRow.dry_run.is_(False))
     watch = watch.model_copy(update={"latest_job": session.scalar(of_loop.order_by(JobRow.number.desc()).limit(1))})
-    session.merge(WatchRow(job_id=job.id, loop=job.loop, open=True, abnormal=False, watch=watch))
+    session.merge(WatchRow(job_id=job.id, loop=job.loop, open=True, alarm=False, watch=watch))
 
 
 def rolled_back(session: Session, job: JobRow) -> None:
@@ -47,20 +47,20 @@ def rolled_back(session: Session, job: JobRow) -> None:
     if row is not None:
         if row.open:
             _set(row, ended(row.watch, WatchEnd.ROLLED_BACK))
-        row.abnormal = False
+        row.alarm = False
 
 
 def put_back(session: Session, job: JobRow) -> None:
     """As `rolled_back`, for the rollback of a watch by itself, which nobody has seen."""
     row = session.get(WatchRow, job.id)
     if row is not None:
-        _set(row, ended(settled(row.watch, put_back=True, why_not=None), WatchEnd.ROLLED_BACK))
+        _set(row, ended(settled(row.watch, rolled_back=True, reason=None), WatchEnd.ROLLED_BACK))
 
 
-def settled(watch: AcceptanceWatch, put_back: bool, why_not: str | None) -> AcceptanceWatch:
+def settled(watch: AcceptanceWatch, rolled_back: bool, reason: str | None) -> AcceptanceWatch:
     """The watch, which has found trouble, with what was done about it."""
     assert watch.trouble is not None
-    trouble = watch.trouble.model_copy(update={"put_back": put_back, "why_not": why_not})
+    trouble = watch.trouble.model_copy(update={"rolled_back": rolled_back, "reason": reason})
     return watch.model_copy(update={"trouble": trouble})
 
 
@@ -112,17 +112,17 @@ def settle(store: Store, job_id: str, make: Change) -> None:
             _set(row, make(row.watch))
 
 
-def abnormal(store: Store) -> list[AbnormalWatch]:
-    """Returns the watches of every host that have found something abnormal, oldest first. Raises SQLAlchemyError."""
+def with_alarm(store: Store) -> list[WatchWithAlarm]:
+    """Returns the watches of every host of which an alarm is made, oldest first. Raises SQLAlchemyError."""
     wanted = (
         select(WatchRow, JobRow.host)
         .join(JobRow, JobRow.id == WatchRow.job_id)
-        .where(WatchRow.abnormal.is_(True))
+        .where(WatchRow.alarm.is_(True))
         .order_by(JobRow.number)
     )
     with store.reading() as session:
-        return [AbnormalWatch(row.job_id, row.loop, host, row.watch) for row, host in session.execute(wanted)]
+        return [WatchWithAlarm(row.job_id, row.loop, host, row.watch) for row, host in session.execute(wanted)]
 
 
 def _set(row: WatchRow, watch: AcceptanceWatch) -> None:
-    row.watch, row.open, row.abnormal = watch, watch.end is None, watch.abnormal
+    row.watch, row.open, row.alarm = watch, watch.end is None, watch.alarm

@@ -19,7 +19,7 @@ from loopwright.service.security.keys import KEY_PATTERN
 from loopwright.service.store.clock import stamp
 
 LogFormat = Literal["text", "json"]
-FIELDS = ("job", "loop", "request", "who", "method", "path", "status", "ms", "address")
+FIELDS = ("job", "loop", "request", "key", "method", "path", "status", "ms", "address")
 """The fields that a line may have besides its message: from `about`, or from `extra`."""
 
 _about: ContextVar[Mapping[str, object]] = ContextVar("about", default=MappingProxyType({}))

@@ -40,8 +40,8 @@ CLOCK_JUMPS = Counter(
     registry=None,
 )  # fmt: skip
 
-FRAMES_HEARD = Counter(
-    "loopwright_frames_heard", "Frames of process data heard for the history", ["bus"], registry=None
+FRAMES_RECEIVED = Counter(
+    "loopwright_frames_received", "Frames of process data received for the history", ["bus"], registry=None
 )
 LISTENING_UP = Gauge(
     "loopwright_listening_up", "1: the process data of the bus is heard for the history", ["bus"], registry=None
@@ -62,6 +62,6 @@ WEBHOOKS_WAITING = Gauge(
 
 OF_THIS_PROCESS = (
     SAMPLES_LOST, STAGE_SECONDS, REQUESTS, REQUEST_SECONDS, IN_FLIGHT, LATE_SECONDS, LATEST_SECONDS, CLOCK_JUMPS,
-    FRAMES_HEARD, LISTENING_UP, LISTENER_RESTARTS, HISTORY_BLOCKS_LOST,
+    FRAMES_RECEIVED, LISTENING_UP, LISTENER_RESTARTS, HISTORY_BLOCKS_LOST,
     WEBHOOK_ATTEMPTS, WEBHOOKS_WAITING,
 )  # fmt: skip

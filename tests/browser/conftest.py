@@ -63,7 +63,7 @@ def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
 
 @pytest.fixture
 def site(processes: Site) -> Iterator[Site]:
-    """The shared processes, the loop at rest on its old gains, the plant at PACE."""
+    """The shared processes, the loop at rest on its previous gains, the plant at PACE."""
     processes.at_rest(PACE)
     yield processes
     processes.left_alone()

@@ -30,7 +30,7 @@ def present(page: Page, tag: str = TAG) -> Locator:
 
 
 def sign(page: Page, name: str = NAME) -> None:
-    page.get_by_label("Signed").fill(name)
+    page.get_by_label("Your name").fill(name)
 
 
 def form(page: Page) -> Locator:

@@ -105,7 +105,7 @@ class Photographer:
 def prepare(fleet: Fleet) -> dict[str, str]:
     """Brings the loops to what the pictures show, but for the tests under way. Returns the URLs of jobs by loop."""
     fleet.pace(3.0)
-    jobs = {tag: fleet.retune(tag, requested_by="M. Weber") for tag in (*ACCEPTED, "QIC-210", WAITS)}
+    jobs = {tag: fleet.retune(tag, by="M. Weber") for tag in (*ACCEPTED, "QIC-210", WAITS)}
     for tag in ACCEPTED:
         assert fleet.finished(jobs[tag], PATIENCE_S)["state"] == "proposed"
         assert fleet.http.post(f"{jobs[tag]}/accept", json={"by": "A. Lind"}).status_code == 200
@@ -114,7 +114,7 @@ def prepare(fleet: Fleet) -> dict[str, str]:
     fleet.http.post(f"{jobs['QIC-210']}/rollback", json={"by": "A. Lind"})
     fleet.change_gains(CHANGED, 55.0, 3.0)
     fleet.pace(1.0)
-    jobs |= {tag: fleet.retune(tag, requested_by="M. Weber") for tag in (REFUSED, RESULT)}
+    jobs |= {tag: fleet.retune(tag, by="M. Weber") for tag in (REFUSED, RESULT)}
     for tag in (REFUSED, RESULT):
         fleet.finished(jobs[tag], PATIENCE_S)
     for tag in jobs:
@@ -131,10 +131,10 @@ def photograph(fleet: Fleet, camera: Photographer, jobs: dict[str, str], locked:
         expect(page.get_by_role("slider", name="Ms")).to_be_enabled()
 
     def refused(page: Page) -> None:
-        expect(person.headline(page)).to_contain_text("No result to trust")
+        expect(person.headline(page)).to_contain_text("Refused: ")
         expect(page.get_by_role("img", name="MV", exact=True)).to_be_visible()
 
-    def abnormal(page: Page) -> None:
+    def alarm(page: Page) -> None:
         expect(page.get_by_role("row").nth(3)).to_be_visible()
 
     def asked(page: Page) -> None:
@@ -157,15 +157,15 @@ def photograph(fleet: Fleet, camera: Photographer, jobs: dict[str, str], locked:
         camera.take(name, f"/ui/loops/{RESULT}", result, size, palette)
     camera.take("refused", f"/ui{jobs[REFUSED]}", refused)
     camera.take("jobs", "/ui/jobs", lambda page: expect(page.get_by_role("row")).to_have_count(len(jobs) + 1), LOW)
-    camera.take("abnormal", "/ui/alarms", abnormal, LOW)
+    camera.take("abnormal", "/ui/alarms", alarm, LOW)
     camera.take("retune", f"/ui/loops/{UNTUNED}", asked, WITH_FORM)
-    camera.take("retunes", "/ui/retunes", many, LOW)
+    camera.take("batches", "/ui/batches", many, LOW)
     camera.take("log", "/ui/log", lambda page: expect(page.get_by_role("row").nth(len(jobs))).to_be_visible(), LOW)
     camera.url, url = locked, camera.url
     camera.take("sign-in", "/ui/", signed_out, SMALL)
     camera.url = url
 
-    under_test = {tag: fleet.retune(tag, requested_by="A. Lind") for tag in UNDER_TEST}
+    under_test = {tag: fleet.retune(tag, by="A. Lind") for tag in UNDER_TEST}
     first = under_test[UNDER_TEST[0]]
     began = fleet.until(first, lambda job: job["stage"] == "relay")["plant_time_s"]
     # Some switches: the wave can be seen.
@@ -178,7 +178,7 @@ def photograph(fleet: Fleet, camera: Photographer, jobs: dict[str, str], locked:
 
     def overview(page: Page) -> None:
         expect(page.locator(".spark path").first).to_be_attached()
-        expect(page.get_by_role("link", name="abnormal")).to_be_visible()
+        expect(page.get_by_role("link", name="active alarm")).to_be_visible()
         expect(page.get_by_role("row", name="TIC-401")).to_contain_text("Bus")
 
     camera.take("test", f"/ui/loops/{UNDER_TEST[0]}", testing)

@@ -32,7 +32,7 @@ def aborts_of(page: Page) -> list[str]:
 
 def is_back(site: Site, page: Page, job: str) -> None:
     """The loop, on the page and in its controller."""
-    expect(person.headline(page)).to_have_text("Stopped: by an operator")
+    expect(person.headline(page)).to_have_text("Aborted: by an operator")
     expect(person.dock(page)).not_to_be_attached()
     expect(person.face(page)).to_contain_text("AUTO")
     expect(person.face(page).locator(".mid").first).to_contain_text("50.000")

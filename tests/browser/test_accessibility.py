@@ -40,8 +40,8 @@ class States(Fleet):
     def __init__(self, stack: ExitStack, folder: Path) -> None:
         super().__init__(stack, folder, MEMBERS, ts=0.1)
         self.pace(10.0)
-        self.proposed = self.retune(requested_by="M. Weber")
-        answer = self.http.post("/retunes", json={"pattern": "FIC-2*", "requested_by": "M. Weber"})
+        self.proposed = self.retune(by="M. Weber")
+        answer = self.http.post("/batches", json={"pattern": "FIC-2*", "by": "M. Weber"})
         assert answer.status_code == 202, answer.text
         self.many = answer.headers["location"]
         assert self.finished(self.proposed)["state"] == "proposed"
@@ -49,7 +49,7 @@ class States(Fleet):
         self.refused = refused["url"]
         assert self.finished(self.refused)["state"] == "refused"
         self.pace(1.0)  # a test in five stages takes minutes
-        self.under_test = self.retune(UNDER_TEST, method="five-stage", requested_by="A. Lind")
+        self.under_test = self.retune(UNDER_TEST, method="five-stage", by="A. Lind")
         self.until(self.under_test, lambda job: job["stage"] not in (None, "preflight"))
 
 
@@ -63,7 +63,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[States]:
 
 def loops(pages: Pages, site: States) -> Page:
     page = pages.open(bypass_csp=True)
-    expect(page.get_by_role("link", name=re.compile(r"\d abnormal"))).to_be_visible()
+    expect(page.get_by_role("link", name=re.compile(r"\d active alarm"))).to_be_visible()
     expect(page.get_by_role("row", name=AT_REST)).to_be_visible()
     return page
 
@@ -90,13 +90,13 @@ def result(pages: Pages, site: States) -> Page:
 def decision(pages: Pages, site: States) -> Page:
     page = result(pages, site)
     page.get_by_role("button", name="Accept the new gains…").click()
-    expect(person.decision(page).get_by_label("Signed")).to_be_focused()
+    expect(person.decision(page).get_by_label("Your name")).to_be_focused()
     return page
 
 
 def refused(pages: Pages, site: States) -> Page:
     page = pages.open(f"/ui{site.refused}", bypass_csp=True)
-    expect(person.headline(page)).to_contain_text("No result to trust")
+    expect(person.headline(page)).to_contain_text("Refused: ")
     return page
 
 
@@ -107,7 +107,7 @@ def jobs(pages: Pages, site: States) -> Page:
 
 
 def many(pages: Pages, site: States) -> Page:
-    page = pages.open("/ui/retunes", bypass_csp=True)
+    page = pages.open("/ui/batches", bypass_csp=True)
     page.get_by_role("textbox", name="Loops").fill("*IC-*")
     expect(page.get_by_role("button", name=re.compile(r"Retune \d loops"))).to_be_visible()
     return page
@@ -119,7 +119,7 @@ def one_of_many(pages: Pages, site: States) -> Page:
     return page
 
 
-def abnormal(pages: Pages, site: States) -> Page:
+def alarm(pages: Pages, site: States) -> Page:
     page = pages.open("/ui/alarms", bypass_csp=True)
     expect(page.get_by_role("row").nth(2)).to_be_visible()
     return page
@@ -145,7 +145,7 @@ def report(pages: Pages, site: States) -> Page:
 
 
 VIEWS: tuple[Callable[[Pages, States], Page], ...] = (
-    loops, at_rest, under_test, result, decision, refused, jobs, many, one_of_many, abnormal, log, keys, report,
+    loops, at_rest, under_test, result, decision, refused, jobs, many, one_of_many, alarm, log, keys, report,
 )  # fmt: skip
 
 

@@ -41,15 +41,15 @@ def test_a_second_path_is_found_in_operation_and_rolled_back(site: SimulatedSite
     loop = site.loop
     page.goto(f"/ui/jobs/{loop.job_id}")
     page.get_by_role("button", name="Accept the new gains").click()
-    itself = page.get_by_role("checkbox", name="Put the old gains back by itself")
+    itself = page.get_by_role("checkbox", name="Put the previous gains back automatically")
     expect(itself).to_be_checked()
     person.sign(page)
     page.get_by_role("button", name=f"Write to {TAG}").click()
     expect(person.headline(page)).to_have_text("Accepted")
     watch = page.get_by_role("region", name="Watch after acceptance")
     expect(watch).to_contain_text("Nothing has moved the loop yet since the gains were accepted.")
-    expect(watch).to_contain_text("The old gains are put back by itself if PV leaves its limits")
-    assert loop.watch.roll_back_by_itself and loop.watch.by == NAME and loop.service.controller.state.gains == NEW
+    expect(watch).to_contain_text("The previous gains are put back automatically if PV leaves its limits")
+    assert loop.watch.auto_rollback and loop.watch.by == NAME and loop.service.controller.state.gains == NEW
 
     loop.goes_on(2.0)
     for size in (1.0, -1.0, 1.5):
@@ -61,20 +61,20 @@ def test_a_second_path_is_found_in_operation_and_rolled_back(site: SimulatedSite
     expect(page.get_by_text("The plant is not the one of the model").first).to_be_visible()
     expect(page.get_by_text("Roll the new gains back, or retune the loop.").first).to_be_visible()
 
-    page.get_by_role("button", name="Roll back to the old gains").click()
+    page.get_by_role("button", name="Roll back to the previous gains").click()
     person.sign(page)
     page.get_by_role("button", name=f"Roll {TAG} back").click()
-    expect(person.headline(page)).to_have_text("Rolled back to the old gains")
-    expect(page.get_by_role("region", name="Result").first).to_contain_text(f"old gains put back by {NAME}")
+    expect(person.headline(page)).to_have_text("Rolled back to the previous gains")
+    expect(page.get_by_role("region", name="Result").first).to_contain_text(f"previous gains put back by {NAME}")
     assert loop.service.controller.state.gains == OLD
 
 
 def test_that_the_old_gains_come_back_by_itself_can_be_declined(site: SimulatedSite, page: Page) -> None:
     page.goto(f"/ui/jobs/{site.loop.job_id}")
     page.get_by_role("button", name="Accept the new gains").click()
-    page.get_by_role("checkbox", name="Put the old gains back by itself").uncheck()
+    page.get_by_role("checkbox", name="Put the previous gains back automatically").uncheck()
     person.sign(page)
     page.get_by_role("button", name=f"Write to {TAG}").click()
     watch = page.get_by_role("region", name="Watch after acceptance")
-    expect(watch).to_contain_text("The old gains are not put back by itself.")
-    assert not site.loop.watch.roll_back_by_itself
+    expect(watch).to_contain_text("The previous gains are not put back automatically.")
+    assert not site.loop.watch.auto_rollback

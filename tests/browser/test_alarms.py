@@ -1,4 +1,4 @@
-"""What is abnormal, on every view, of a loop whose plant is switched off in the middle of a test; signed off."""
+"""What is abnormal, on every view, of a loop whose plant is switched off in the middle of a test; acknowledged."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def site(tmp_path: Path) -> Iterator[Site]:
 def test_a_plant_that_is_switched_off_in_a_test(site: Site, pages: Pages) -> None:
     abnormal, loops = pages.open("/ui/alarms"), pages.open()
     expect(loops.get_by_role("row", name=TAG).locator(".pvnum")).to_have_text(re.compile(r"^50\."))
-    expect(abnormal.get_by_text("Nothing is abnormal.")).to_be_visible()
+    expect(abnormal.get_by_text("No active alarms.")).to_be_visible()
     expect(abnormal).to_have_title("Loopwright")
-    job = site.http.post(f"/loops/{TAG}/retune", json={"requested_by": "A. Lind"}).json()["url"]
+    job = site.http.post(f"/loops/{TAG}/retune", json={"by": "A. Lind"}).json()["url"]
     until(lambda: site.http.get(job).json()["stage"] == "relay")
     site.plant.stop()
 
@@ -38,24 +38,24 @@ def test_a_plant_that_is_switched_off_in_a_test(site: Site, pages: Pages) -> Non
     failed = abnormal.get_by_role("row", name=re.compile("The last test failed"))
     expect(failed.get_by_role("link", name="the test")).to_have_attribute("href", f"/ui{job}")
     expect(abnormal).to_have_title("(2) Loopwright")
-    expect(abnormal.get_by_role("link", name="2 abnormal")).to_be_visible()
+    expect(abnormal.get_by_role("link", name="2 active alarm")).to_be_visible()
     expect(lost.get_by_role("button")).to_have_count(0)
     expect(loops.get_by_role("row", name=TAG)).to_contain_text("Node 10h (16) is lost")
 
-    failed.get_by_role("button", name="Sign off").click()
-    field = abnormal.get_by_label("Signed")
+    failed.get_by_role("button", name="Acknowledge").click()
+    field = abnormal.get_by_label("Your name")
     expect(field).to_be_focused()
-    expect(abnormal.get_by_role("button", name="Sign off", exact=True)).to_be_disabled()
+    expect(abnormal.get_by_role("button", name="Acknowledge", exact=True)).to_be_disabled()
     field.fill("B. Berg")
     field.press("Enter")
     expect(abnormal).to_have_title("(1) Loopwright")
     expect(failed).to_have_count(0)
-    (entry,) = site.http.get("/audit?what=alarm_sign_off").json()
-    assert (entry["said_by"], entry["loop"]) == ("B. Berg", TAG)
+    (entry,) = site.http.get("/audit?what=acknowledge_alarm").json()
+    assert (entry["by"], entry["loop"]) == ("B. Berg", TAG)
 
     with pages.expecting("ERR_CONNECTION_REFUSED"):
         assert site.service.stop() == 0
-        silent = abnormal.get_by_role("row", name=re.compile("No word from the service"))
+        silent = abnormal.get_by_role("row", name=re.compile("Service offline"))
         expect(silent).to_be_visible()
         expect(abnormal.get_by_role("row", name=re.compile(r"Node 10h \(16\) is lost"))).to_have_class("old")
         expect(abnormal).to_have_title("(2) Loopwright")

@@ -25,11 +25,11 @@ def test_ages_are_of_the_service_and_what_is_live_is_live(site: Site, pages: Pag
     context.clock.install(time=datetime.now(UTC) + timedelta(hours=wrong_h))
     page = pages.another(context)
     row = page.get_by_role("row", name=TAG)
-    expect(row).to_contain_text(re.compile(r"decision waits\s*(just now|\d+.s ago|[1-5].min ago)"))
+    expect(row).to_contain_text(re.compile(r"awaiting decision\s*(just now|\d+.s ago|[1-5].min ago)"))
     expect(row.locator(".pvnum")).to_have_text(re.compile(r"^50\.0"))
     person.open_loop(page)
     expect(person.face(page).locator(".mode").first).to_have_text("AUTO")
-    expect(page.get_by_text("No word from the service")).to_have_count(0)
+    expect(page.get_by_text("Service offline")).to_have_count(0)
     plot = page.get_by_role("img", name=f"PV and set-point of {TAG}")
     expect(plot.locator("canvas")).to_be_visible()
 
@@ -47,4 +47,4 @@ def test_a_tab_that_nobody_sees_gives_its_stream_up_and_comes_back(site: Site, p
     with page.expect_request("**/live*"):
         page.evaluate(HIDE, False)
     expect(page.get_by_role("row", name=TAG).locator(".c-sp")).to_have_text("50.050")
-    expect(page.get_by_text("No word from the service")).to_have_count(0)
+    expect(page.get_by_text("Service offline")).to_have_count(0)

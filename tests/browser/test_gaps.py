@@ -110,12 +110,12 @@ def test_the_plant_is_started_anew(site: Site, page: Page) -> None:
 def test_the_plant_stops_and_then_the_bus_goes_and_comes_back(site: Site, page: Page) -> None:
     row = page.get_by_role("row", name=TAG)
     expect(row.locator(".pvnum")).to_have_text("50.000")
-    expect(page.get_by_text("Nothing abnormal")).to_be_visible()
+    expect(page.get_by_text("No active alarms")).to_be_visible()
     site.plant.kill()
     expect(row.locator(".age")).to_have_text(AGE)
     expect(row.locator(".pvnum")).to_have_text("50.000")
     expect(row).to_contain_text("Node 10h (16) is lost")
-    expect(page.get_by_role("link", name="1 abnormal")).to_be_visible()
+    expect(page.get_by_role("link", name="1 active alarm")).to_be_visible()
     site.hub.kill()
     expect(row).to_contain_text(f"Bus {site.bus} is down")
     expect(page.get_by_text(f"Bus {site.bus} is down, opening it again every 2 s.")).to_be_visible()
@@ -150,7 +150,7 @@ def test_the_bus_goes_and_comes_back_while_its_trend_is_watched(site: Site, page
     site.start_hub()
     expect(person.present(page).locator(".big")).to_have_text("50.000")
     expect(main).not_to_contain_text(down)
-    expect(page.get_by_text("Nothing abnormal")).to_be_visible()
+    expect(page.get_by_text("No active alarms")).to_be_visible()
     page.get_by_role("button", name="2 min").click()
     assert one_gap(page, 120.0) > max(3.0, age_s)
     seen_later(page, "2 min", 120.0)
@@ -160,7 +160,7 @@ def test_the_bus_goes_in_a_test_and_comes_back(site: Site, page: Page) -> None:
     site.write("plant_pace", 2.0)
     person.open_loop(page)
     job = site.in_stage(STAGES["fast-relay"])
-    person.in_stage(page, "Relay")
+    person.in_stage(page, "Relay test")
     site.hub.kill()
     expect(page.get_by_role("main")).to_contain_text(f"Bus {site.bus} is down")
     is_old(page, re.compile(r"\d"))
@@ -198,7 +198,7 @@ class TestFramesLost:
         lost_s = time.monotonic() - began_s  # a busy machine brings samples late, and several at once
         hub.fault = well
         assert lost_s - 0.3 < one_gap(page) < lost_s + 1.0
-        expect(page.get_by_text("Nothing abnormal")).to_be_visible()
+        expect(page.get_by_text("No active alarms")).to_be_visible()
         expect(person.present(page).locator(".big")).to_have_text("50.000")
         seen_later(page)
 
@@ -208,7 +208,7 @@ class TestFramesLost:
         site.write("plant_pace", SLOW)
         person.open_loop(page)
         job = site.in_stage(STAGES["fast-relay"])
-        person.in_stage(page, "Relay")
+        person.in_stage(page, "Relay test")
         page.get_by_role("button", name="30 s").click()
         until(page, lambda: len(trend.columns(page)[0]) > 0 and empty_at_the_right(page) < 0.1)
         assert trend.gaps(page, WINDOW_S) == []
@@ -223,7 +223,7 @@ class TestFramesLost:
         hub.fault = once
         assert one_gap(page) > 1.2 * site.case.ts / SLOW  # from the sample before to the one behind: two sample times
         expect(person.under_test(page)).to_be_visible()
-        expect(page.get_by_text("Nothing abnormal")).to_be_visible()
+        expect(page.get_by_text("No active alarms")).to_be_visible()
         assert site.job(job)["state"] == "running"
         site.http.post(f"{job}/abort")
         site.finished(job)

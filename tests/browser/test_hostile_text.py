@@ -40,8 +40,8 @@ def test_it_is_text_everywhere(site: Site, pages: Pages, page: Page) -> None:
     expect(page.get_by_text(f"Asked for by {HOSTILE}")).to_be_visible()
     expect(person.headline(page)).to_have_text("New gains are proposed")
     shown(page)
-    page.get_by_role("button", name="Keep the old gains…").click()
-    person.decision(page).get_by_role("button", name="Keep the old gains").click()
+    page.get_by_role("button", name="Keep the previous gains…").click()
+    person.decision(page).get_by_role("button", name="Keep the previous gains").click()
     expect(person.decision(page)).to_contain_text(f"decided by {HOSTILE}")
     for path in ("/jobs", "/log"):
         page.goto(f"/ui{path}")

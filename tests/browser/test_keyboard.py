@@ -31,7 +31,7 @@ def test_a_retune_is_started_and_aborted(site: Site, page: Page) -> None:
     if opener.is_visible():
         tab_to(page, opener)
         page.keyboard.press("Enter")
-    signed = person.form(page).get_by_label("Signed")
+    signed = person.form(page).get_by_label("Your name")
     tab_to(page, signed)
     page.keyboard.press("ControlOrMeta+a")
     page.keyboard.type(person.NAME)
@@ -39,7 +39,7 @@ def test_a_retune_is_started_and_aborted(site: Site, page: Page) -> None:
     page.keyboard.press("Enter")  # in the name field
     expect(person.under_test(page)).to_contain_text(f"Asked for by {person.NAME}")
     expect(person.under_test(page)).to_be_focused()
-    person.in_stage(page, "Relay")
+    person.in_stage(page, "Relay test")
     page.keyboard.press("Control+.")
-    expect(person.headline(page)).to_contain_text("Stopped: by an operator")
+    expect(person.headline(page)).to_contain_text("Aborted: by an operator")
     assert site.is_home()

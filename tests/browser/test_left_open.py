@@ -32,8 +32,8 @@ from tests.unit.service.served import served
 LOOP = f"/ui/loops/{TAG}"
 OTHER = "FIC-2"
 LIVE_JOB: dict[str, Any] = {
-    "id": "4f0c2a9be113", "url": "/jobs/4f0c2a9be113", "loop": TAG, "host": "gw-2", "state": "running",
-    "dry_run": False, "requested_by": "A. Lind", "stage": "relay", "progress": None, "remaining_plant_time_s": None,
+    "id": "4f0c2a9be113", "url": "/jobs/4f0c2a9be113", "loop": TAG, "gateway": "gw-2", "state": "running",
+    "dry_run": False, "by": "A. Lind", "stage": "relay", "progress": None, "remaining_plant_time_s": None,
     "plant_time_s": 0.0, "stopping": True,
 }  # fmt: skip
 """Of a gateway that says nothing."""
@@ -58,7 +58,7 @@ def site(tmp_path: Path) -> Iterator[SimulatedSite]:
 def proposal(service: Service, tag: str = TAG) -> str:
     """The id of a job whose proposal waits for a decision."""
     service.tune.hold.set()
-    job_id = service.jobs.start(tag, FastRetune(requested_by=person.NAME)).id
+    job_id = service.jobs.start(tag, FastRetune(by=person.NAME)).id
     service.wait(job_id)
     return job_id
 
@@ -106,7 +106,7 @@ class TestWhatOthersDo:
     def test_a_decision_is_seen_in_the_list_of_jobs(self, site: SimulatedSite, pages: Pages) -> None:
         job_id = proposal(site.service)
         page = pages.open("/ui/jobs")
-        expect(page.get_by_role("row", name=TAG)).to_contain_text("decision waits")
+        expect(page.get_by_role("row", name=TAG)).to_contain_text("awaiting decision")
         site.service.jobs.decisions.rollback(job_id, "B. Roth")
         expect(page.get_by_role("row", name=TAG)).to_contain_text("B. Roth")
 
@@ -116,12 +116,12 @@ class TestWhatOthersDo:
         page = pages.open(LOOP)
         known = page.get_by_role("region", name="What is known of the plant")
         found = {
-            "knowledge": {"Ms": 1.61, "uncertainty": 0.02, "model": {"dead_time_s": 2.0}, "changes": 3, "agreeing": 0,
+            "knowledge": {"Ms": 1.61, "uncertainty": 0.02, "model": {"dead_time_s": 2.0}, "changes": 3, "consistent": 0,
                           "text": "Ms known"},
             "known": "", "detail": "", "advice": None, "changes_used": [], "changes_dropped": [], "loads": [],
         }  # fmt: skip
         page.route("**/observation", lambda route: route.fulfill(json=found))
-        page.get_by_role("button", name="Look at normal operation").click()
+        page.get_by_role("button", name="Identify from operation").click()
         expect(known).to_contain_text("1.61")
         proposal(site.service)
         expect(known).not_to_contain_text("1.61")
@@ -137,7 +137,8 @@ class TestAbort:
         dock = person.dock(page)
         expect(dock).to_contain_text("abort sent, no answer yet")
         expect(dock.get_by_role("alert")).to_have_text(
-            "Abort not confirmed: The service has not answered within 10 s: it is not known whether it has heard this."
+            "Abort not confirmed: The service has not answered within 10 s: it is not known whether it has received "
+            "this."
         )
         expect(dock).not_to_contain_text("restored")
         page.unroute("**/abort")
@@ -163,19 +164,19 @@ class TestAbort:
     def test_that_it_is_stored_is_not_said_to_be_heard_by_a_gateway_that_is_silent(
         self, site: SimulatedSite, pages: Pages
     ) -> None:
-        hello = {"host": "local", "version": "0.1.0", "now_s": 1769860830.5, "loops": [], "back_s": 10.0}
+        hello = {"gateway": "local", "version": "0.1.0", "now_s": 1769860830.5, "loops": [], "back_s": 10.0}
         text = stream(hello=hello, jobs={"jobs": [LIVE_JOB]})
         page = pages.open("/ui/jobs")
         page.route("**/live*", lambda route: route.fulfill(body=text, content_type="text/event-stream"))
         page.reload()
         dock = person.dock(page)
-        expect(dock).to_contain_text("asked to stop, gateway gw-2 has not said that it has heard")
+        expect(dock).to_contain_text("asked to stop, gateway gw-2 has not confirmed it")
         expect(dock).not_to_contain_text("restored")
 
     def test_one_whose_answer_was_lost_is_confirmed_by_the_stream(self, site: SimulatedSite, pages: Pages) -> None:
         page = pages.open("/ui/jobs")
-        job = LIVE_JOB | {"host": "local", "progress": 0.4}
-        hello = {"host": "local", "version": "0.1.0", "now_s": time.time(), "loops": [], "back_s": 10.0}
+        job = LIVE_JOB | {"gateway": "local", "progress": 0.4}
+        hello = {"gateway": "local", "version": "0.1.0", "now_s": time.time(), "loops": [], "back_s": 10.0}
         text = stream(hello=hello, jobs={"jobs": [job | {"stopping": False}]})
         page.route("**/live*", lambda route: route.fulfill(body=text, content_type="text/event-stream"))
         page.reload()
@@ -217,17 +218,17 @@ class TestAbort:
 class TestManyLoops:
     def test_what_is_begun_is_what_was_announced(self, site: SimulatedSite, pages: Pages) -> None:
         """Who types on and presses the button before the next announcement has come begins nothing."""
-        page = pages.open("/ui/retunes")
+        page = pages.open("/ui/batches")
         person.sign(page)
         loops = page.get_by_label("Loops", exact=True)
         loops.fill("TIC-*")
         expect(page.get_by_role("button", name="Retune 1 loop")).to_be_enabled()
-        page.route("**/retunes/preview", lambda route: None)
+        page.route("**/batches/preview", lambda route: None)
         loops.fill("*")
         expect(page.get_by_role("button", name="Retune 1 loop")).to_be_disabled()
 
     def test_a_field_that_is_no_number_is_not_left_out(self, site: SimulatedSite, pages: Pages) -> None:
-        page = pages.open("/ui/retunes")
+        page = pages.open("/ui/batches")
         person.sign(page)
         page.get_by_label("Loops", exact=True).fill("*")
         expect(page.get_by_role("button", name="Retune 2 loops")).to_be_enabled()
@@ -279,7 +280,7 @@ class TestStream:
         banner = ".banner[role=alert]"
         person.remember(page, banner)
         until(lambda: len(person.remembered(page)) > 0, "the banner")
-        assert held and "No word from the service" in person.remembered(page)[0]
+        assert held and "Service offline" in person.remembered(page)[0]
         expect(page.locator(banner)).not_to_be_attached()
 
     def test_what_was_heard_before_a_page_was_hidden_is_not_shown_as_present(
@@ -289,10 +290,10 @@ class TestStream:
         context.clock.install()
         values = {
             "tag": TAG, "pv": 50.0, "sp": 50.0, "mv": 40.0, "mode": "automatic", "age_s": 0.1, "under_test": False,
-            "on_trial": False, "not_heard": None, "last": None, "host": "local", "job": None, "last_job": None,
+            "on_trial": False, "no_data": None, "last": None, "gateway": "local", "job": None, "last_job": None,
         }  # fmt: skip
         now_s = time.time()
-        hello = {"host": "local", "version": "0.1.0", "now_s": now_s, "loops": [TAG], "back_s": 10.0}
+        hello = {"gateway": "local", "version": "0.1.0", "now_s": now_s, "loops": [TAG], "back_s": 10.0}
         text = stream(hello=hello, loops={"now_s": now_s, "loops": [values]})
         context.route("**/live*", lambda route: route.fulfill(body=text, content_type="text/event-stream"))
         page = pages.another(context, LOOP)
@@ -328,7 +329,7 @@ class TestStream:
         context = pages.context()
         context.clock.install()
         page = pages.another(context, "/ui/alarms")
-        expect(page.get_by_text("Nothing is abnormal.")).to_be_visible()
+        expect(page.get_by_text("No active alarms.")).to_be_visible()
         page.evaluate(HIDE, True)
         page.clock.fast_forward("01:05")
         service = site.service

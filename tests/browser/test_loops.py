@@ -38,12 +38,12 @@ def test_a_loop_is_found_and_opened(site: Site, page: Page) -> None:
 def test_a_loop_that_was_never_heard_is_abnormal_and_shows_dashes(site: Site, page: Page) -> None:
     row = page.get_by_role("row", name=ABSENT["tag"])
     expect(row.locator(".pvnum")).to_have_text(DASH)
-    expect(row).to_contain_text("No data since the bus is heard")
-    expect(page.get_by_role("link", name="1 abnormal")).to_be_visible()
-    page.get_by_label("only what needs a look").check()
+    expect(row).to_contain_text("No data since the bus is up")
+    expect(page.get_by_role("link", name="1 active alarm")).to_be_visible()
+    page.get_by_label("needs attention").check()
     expect(row).to_be_visible()
-    page.get_by_role("link", name="1 abnormal").click()
-    expect(page.get_by_role("row", name=ABSENT["tag"])).to_contain_text("No data since the bus is heard")
+    page.get_by_role("link", name="1 active alarm").click()
+    expect(page.get_by_role("row", name=ABSENT["tag"])).to_contain_text("No data since the bus is up")
 
 
 def test_pv_moves_on_the_page_as_it_moves_in_the_plant(site: Site, page: Page) -> None:

@@ -27,7 +27,7 @@ COLUMN_S = 2.0
 
 def nothing_is_live(page: Page) -> None:
     """The banner stands, and no number of the process is shown."""
-    expect(page.locator(SILENT)).to_contain_text("No word from the service for")
+    expect(page.locator(SILENT)).to_contain_text("Service offline for")
     face = person.face(page)
     expect(face.locator(".big")).to_have_text(DASH)
     expect(face.locator(".mid")).to_have_text([re.compile(f"^{DASH}"), re.compile(f"^{DASH}")])
@@ -67,10 +67,10 @@ def test_a_service_that_stands_still(site: Site, page: Page) -> None:
         page.get_by_role("button", name="Retune…").click()
         person.sign(page)
         expect(page.get_by_role("button", name=f"Retune {TAG}")).to_be_disabled()
-        expect(page.get_by_role("region", name="Retune")).to_contain_text("The service is silent.")
+        expect(page.get_by_role("region", name="Retune")).to_contain_text("The service is offline.")
         page.get_by_role("link", name="Loops", exact=True).click()
         expect(page.get_by_role("row", name=TAG).locator(".pvnum")).to_have_text(DASH)
-        expect(page.get_by_role("link", name=re.compile("abnormal"))).to_be_visible()
+        expect(page.get_by_role("link", name=re.compile("active alarm"))).to_be_visible()
     expect(page.locator(SILENT)).not_to_be_attached()
     expect(page.get_by_role("row", name=TAG).locator(".pvnum")).to_have_text("50.000")
     person.open_loop(page)
@@ -81,7 +81,7 @@ def test_a_service_that_is_killed_in_mid_test_and_comes_back(site: Site, page: P
     site.at_rest(0.3 * PACE)
     person.open_loop(page)
     job = site.in_stage(STAGES["fast-relay"])
-    person.in_stage(page, "Relay")
+    person.in_stage(page, "Relay test")
     person.remember(page, SILENT)
     before_s = time.monotonic()
     with pages.expecting(AWAY):

@@ -16,7 +16,7 @@ from tests.browser.site import TAG, Site
 @pytest.fixture
 def filed(site: Site, page: Page, tmp_path: Path) -> Path:
     """The report of a fast retune, by its button, saved."""
-    assert site.finished(site.retune(requested_by=person.NAME))["state"] == "proposed"
+    assert site.finished(site.retune(by=person.NAME))["state"] == "proposed"
     person.open_loop(page)
     with page.expect_popup() as opened:
         page.get_by_role("link", name="Report").click()

@@ -13,7 +13,7 @@ from tests.browser import person
 from tests.browser.person import NAME
 from tests.browser.site import TAG, Site
 
-STAGES = ["At rest?", "Relay", "Model and gains", "Step", "Whole record"]
+STAGES = ["Steady-state check", "Relay test", "Model and gains", "Set-point step, new gains", "Final model"]
 
 
 def assert_drawn(page: Page, values: list[float]) -> None:
@@ -32,7 +32,7 @@ def test_retuned_compared_accepted_and_rolled_back(site: Site, page: Page) -> No
     expect(form).to_contain_text("Then the set-point steps by 0.100\u202f°C under the new gains.")
     expect(form).to_contain_text("It ends by itself if PV leaves 49.000 … 51.000\u202f°C")
     start = page.get_by_role("button", name=f"Retune {TAG}")
-    expect(form).to_contain_text("Who signs?")
+    expect(form).to_contain_text("Your name is missing.")
     expect(start).to_be_disabled()
     page.get_by_role("button", name="More options").click()
     form.get_by_label("SP step").fill("x")
@@ -46,17 +46,17 @@ def test_retuned_compared_accepted_and_rolled_back(site: Site, page: Page) -> No
     expect(person.abort_button(page)).to_be_visible()
     expect(person.headline(page)).to_have_text("New gains are proposed")
     seen = [stage for stage in person.remembered(page) if stage in STAGES]
-    assert seen == sorted(seen, key=STAGES.index) and {"Relay", "Step"} <= set(seen)
+    assert seen == sorted(seen, key=STAGES.index) and {"Relay test", "Set-point step, new gains"} <= set(seen)
 
     job = site.latest()
-    assert (job["state"], job["requested_by"]) == ("proposed", NAME)
+    assert (job["state"], job["by"]) == ("proposed", NAME)
     Kp, Ti = (person.figure(page, name) for name in ("Gain Kp", "Integral time Ti"))
     assert Kp == pytest.approx((old.kp, job["new_gains"]["Kp"]), rel=5e-4)
     assert Ti == pytest.approx((old.ti, job["new_gains"]["Ti"]), rel=5e-4)
     assert person.figure(page, "Largest sensitivity Ms")[1] == pytest.approx(1.6, abs=0.01)
 
     designs = site.ask(f"{job['url']}/designs")
-    assert_drawn(page, designs["after_curves"]["setpoint"]["pv"])
+    assert_drawn(page, designs["new_curves"]["setpoint"]["pv"])
 
     # a slower loop by the slider: other gains in the table, and no way to accept what was not on the loop
     slider = page.get_by_role("slider", name="Ms", exact=True)
@@ -75,15 +75,15 @@ def test_retuned_compared_accepted_and_rolled_back(site: Site, page: Page) -> No
     page.get_by_role("button", name="Accept the new gains").click()
     asked = person.decision(page)
     expect(asked).to_contain_text(f"into {TAG}, node 20h channel 1, for good.")
-    expect(asked.get_by_label("Signed")).to_be_focused()
+    expect(asked.get_by_label("Your name")).to_be_focused()
     assert site.state().gains.Kp == pytest.approx(old.kp)
     page.keyboard.press("Escape")
-    expect(asked.get_by_label("Signed")).not_to_be_attached()
+    expect(asked.get_by_label("Your name")).not_to_be_attached()
     expect(page.get_by_role("button", name="Accept the new gains")).to_be_focused()
     page.keyboard.press("Enter")
     page.get_by_role("button", name=f"Write to {TAG}").click()
     expect(person.headline(page)).to_have_text("Accepted")
-    expect(page.locator(".choice")).to_contain_text(designs["after_beside"])
+    expect(page.locator(".choice")).to_contain_text(designs["new_beside"])
     expect(page.locator(".choice")).not_to_contain_text("present gains")
     expect(person.decision(page)).to_contain_text(f"Accepted by {NAME}; in effect now: Kp {Kp[1]:.2f}")
     gains = site.ask(f"/loops/{TAG}")["live"]["gains"]
@@ -91,10 +91,10 @@ def test_retuned_compared_accepted_and_rolled_back(site: Site, page: Page) -> No
     assert site.state().gains.Kp == pytest.approx(job["new_gains"]["Kp"])
     expect(page.get_by_role("region", name="Gains and limits")).to_contain_text(f"{Kp[1]:.2f}")
 
-    page.get_by_role("button", name="Roll back to the old gains").click()
-    expect(person.decision(page)).to_contain_text("Write the old gains, Kp 80.00 %/°C, Ti 1.200 s, back")
+    page.get_by_role("button", name="Roll back to the previous gains").click()
+    expect(person.decision(page)).to_contain_text("Write the previous gains, Kp 80.00 %/°C, Ti 1.200 s, back")
     page.get_by_role("button", name=f"Roll {TAG} back").click()
-    expect(person.headline(page)).to_have_text("Rolled back to the old gains")
+    expect(person.headline(page)).to_have_text("Rolled back to the previous gains")
     assert site.is_home() and site.job(job["url"])["state"] == "rolled_back"
 
 
@@ -111,12 +111,12 @@ def test_another_Ms_is_tried_on_the_loop_before_it_can_be_accepted(site: Site, p
     person.sign(page)
     page.get_by_role("button", name=f"Try Ms 1.40 on {TAG}").click()
     expect(person.under_test(page)).to_be_visible()
-    expect(person.under_test(page).get_by_role("listitem")).not_to_contain_text(["Relay"])
+    expect(person.under_test(page).get_by_role("listitem")).not_to_contain_text(["Relay test"])
     expect(person.headline(page)).to_have_text("New gains are proposed")
     expect(page.get_by_role("region", name="Result")).to_contain_text("Ms 1.40 on the model")
     second = site.latest()
-    assert second["url"] != first["url"] and (second["state"], second["requested_by"]) == ("proposed", NAME)
-    assert second["predicted"]["Ms"] == pytest.approx(1.4, abs=0.01) and second["after"]["settled"]
+    assert second["url"] != first["url"] and (second["state"], second["by"]) == ("proposed", NAME)
+    assert second["predicted"]["Ms"] == pytest.approx(1.4, abs=0.01) and second["step_after"]["settled"]
     assert second["new_gains"]["Kp"] < first["new_gains"]["Kp"] and site.is_home()
     expect(page.get_by_role("button", name="Accept the new gains")).to_be_enabled()
     # the first proposal is no longer to be decided
@@ -134,13 +134,13 @@ def test_gains_are_not_offered_for_a_trial_in_manual(site: Site, page: Page) -> 
         slider.press("Shift+ArrowLeft")
     offered = page.get_by_role("button", name=f"Try Ms 1.40 on {TAG}")
     offered.click()
-    expect(page.get_by_label("Signed")).to_be_visible()
+    expect(page.get_by_label("Your name")).to_be_visible()
     site.write("controller_mode_command", Mode.MANUAL)
     expect(person.decision(page)).to_contain_text(
         "cannot be tried: a trial steps the set-point, and the loop is in manual"
     )
     expect(offered).not_to_be_attached()
-    expect(page.get_by_label("Signed")).not_to_be_attached()
+    expect(page.get_by_label("Your name")).not_to_be_attached()
     page.get_by_role("button", name="Back to Ms 1.60").click()
     expect(page.get_by_role("button", name="Accept the new gains")).to_be_enabled()
     slider.press("Shift+ArrowLeft")

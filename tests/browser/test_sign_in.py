@@ -95,9 +95,9 @@ def test_a_key_that_may_read_has_no_button_that_changes_something(
     sent: list[str] = []
     page.on("request", lambda request: sent.append(request.method))
     page.keyboard.press("Control+.")
-    with page.expect_request("**/retunes*"):
-        page.get_by_role("link", name="Retunes").click()
-    expect(main.get_by_role("heading", name="Retunes")).to_be_visible()
+    with page.expect_request("**/batches*"):
+        page.get_by_role("link", name="Batches").click()
+    expect(main.get_by_role("heading", name="Batches")).to_be_visible()
     expect(main.get_by_role("button")).to_have_count(0)
     assert set(sent) == {"GET"}
     with_key = {"Authorization": f"Bearer {operate}"}

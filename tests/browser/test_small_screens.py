@@ -21,8 +21,8 @@ def fits(page: Page) -> None:
 @pytest.mark.parametrize("size", [TABLET, PHONE], ids=["tablet", "phone"])
 def test_every_view_fits(site: Site, pages: Pages, size: dict[str, int]) -> None:
     result = site.finished(site.retune())
-    assert site.http.post("/retunes", json={"requested_by": "me", "pattern": ABSENT["tag"]}).status_code == 202
-    [many] = site.ask("/retunes?limit=1")
+    assert site.http.post("/batches", json={"by": "me", "pattern": ABSENT["tag"]}).status_code == 202
+    [many] = site.ask("/batches?limit=1")
     page = pages.open(viewport=size)
     expect(page.locator(".loops")).to_be_visible()
     fits(page)
@@ -37,9 +37,9 @@ def test_every_view_fits(site: Site, pages: Pages, size: dict[str, int]) -> None
     for path, name in (
         (result["url"], TAG),
         ("/jobs", "Jobs"),
-        ("/retunes", "Retunes of many loops"),
-        (many["url"], "Retune of 1 loop"),
-        ("/alarms", "Abnormal"),
+        ("/batches", "Batches"),
+        (many["url"], "Batch of 1 loop"),
+        ("/alarms", "Alarms"),
         ("/log", "Log"),
     ):
         page.goto(f"/ui{path}")

@@ -18,7 +18,7 @@ OTHER = "B. Roth"
 
 
 def proposed(site: Site) -> None:
-    assert site.finished(site.retune(requested_by=person.NAME))["state"] == "proposed"
+    assert site.finished(site.retune(by=person.NAME))["state"] == "proposed"
 
 
 def test_the_test_of_one_is_seen_by_the_other(site: Site, pages: Pages, page: Page) -> None:
@@ -29,10 +29,10 @@ def test_the_test_of_one_is_seen_by_the_other(site: Site, pages: Pages, page: Pa
     person.retune(page)
     expect(person.under_test(other)).to_contain_text(f"Asked for by {person.NAME}")
     expect(other.get_by_role("region", name="Retune")).to_have_count(0)
-    person.in_stage(other, "Relay")
+    person.in_stage(other, "Relay test")
     person.abort_button(other).click()
     for each in (page, other):
-        expect(person.headline(each)).to_contain_text("Stopped: by an operator")
+        expect(person.headline(each)).to_contain_text("Aborted: by an operator")
     assert site.is_home()
 
 
@@ -40,16 +40,16 @@ def test_no_other_test_than_the_one_that_has_ended_is_shown(site: Site, pages: P
     """Neither the result of the one before it, nor the record of one that ended before it had any."""
     without_record(site)
     person.open_loop(page)
-    expect(person.headline(page)).to_contain_text("Stopped: by an operator")
+    expect(person.headline(page)).to_contain_text("Aborted: by an operator")
     expect(page.get_by_role("region", name="Record")).to_have_count(0)
     proposed(site)
     expect(person.headline(page)).to_have_text("New gains are proposed")
     site.write("plant_pace", 1.0)
     url = site.retune()
-    person.in_stage(page, "Relay")
+    person.in_stage(page, "Relay test")
     person.remember(page, "section[aria-label=Result] h2")
     site.http.post(f"{url}/abort")
-    expect(person.headline(page)).to_contain_text("Stopped: by an operator")
+    expect(person.headline(page)).to_contain_text("Aborted: by an operator")
     assert len(person.remembered(page)) == 1
 
 
@@ -78,7 +78,7 @@ def test_who_asks_too_late_is_shown_the_test_of_the_other(site: Site, pages: Pag
     def overtaken(route: Route) -> None:
         """The other one's request arrives first."""
         site.write("plant_pace", 1.0)
-        started.append(site.retune(requested_by=person.NAME))
+        started.append(site.retune(by=person.NAME))
         route.continue_()
 
     page.route("**/retune", overtaken)
@@ -87,7 +87,7 @@ def test_who_asks_too_late_is_shown_the_test_of_the_other(site: Site, pages: Pag
         expect(person.under_test(page)).to_contain_text(f"Asked for by {person.NAME}")
     expect(page.get_by_role("region", name="Retune")).to_have_count(0)
     [url] = started
-    person.in_stage(page, "Relay")
+    person.in_stage(page, "Relay test")
     site.http.post(f"{url}/abort")
     site.finished(url)
 
@@ -103,10 +103,10 @@ def test_what_one_accepts_the_other_sees(site: Site, pages: Pages, page: Page) -
     page.get_by_role("button", name=f"Write to {TAG}").click()
     expect(person.headline(other)).to_have_text("Accepted")
     expect(person.decision(other)).to_contain_text(f"Accepted by {person.NAME}")
-    other.get_by_role("button", name="Roll back to the old gains…").click()
+    other.get_by_role("button", name="Roll back to the previous gains…").click()
     person.sign(other, OTHER)
     other.get_by_role("button", name=f"Roll {TAG} back").click()
-    expect(person.headline(page)).to_have_text("Rolled back to the old gains")
+    expect(person.headline(page)).to_have_text("Rolled back to the previous gains")
     assert site.is_home()
 
 

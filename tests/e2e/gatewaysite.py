@@ -80,7 +80,7 @@ class GatewaySite:
         loops = self._folder / f"{host}.yaml"
         loops.write_text(yaml.safe_dump({"loops": [loop]}))
         where = ("--loops", str(loops), "--data", str(self._folder / host), "--port", "0", "--node", node)
-        shared = ("--database", self._database, "--host", host)
+        shared = ("--database", self._database, "--gateway", host)
         return self._run(host, "loopwright.service", "serve", *where, *shared, *more)
 
     @property
@@ -129,7 +129,7 @@ class GatewaySite:
 
     def retune(self) -> str:
         self.at_rest()
-        answer = self.post(f"/loops/{LOOP}/retune", requested_by="A. Lind")
+        answer = self.post(f"/loops/{LOOP}/retune", by="A. Lind")
         assert answer.status_code == 202, answer.text
         return str(answer.headers["location"])
 

@@ -256,7 +256,7 @@ class Plantsite:
             tuner.close()
 
     def retune(self, tag: str | None = None, **options: Any) -> str:
-        answer = self.http.post(f"/loops/{tag or self.tag}/retune", json={"requested_by": "me"} | options)
+        answer = self.http.post(f"/loops/{tag or self.tag}/retune", json={"by": "me"} | options)
         assert answer.status_code == 202, answer.text
         return answer.headers["location"]
 
@@ -289,7 +289,7 @@ class Plantsite:
     ) -> dict[str, Any]:
         """The watch of a job whose gains were accepted, once it is as wanted."""
         deadline = time.monotonic() + patience_s
-        while not wanted(watch := self.job(url)["watch"]):
+        while not wanted(watch := self.job(url)["monitoring"]):
             assert time.monotonic() < deadline, watch
             time.sleep(0.1)
         return dict(watch)

@@ -145,7 +145,7 @@ def test_in_a_terminal_the_loop_goes_on_until_ctrl_c(tmp_path: Path, demos: list
         accepted = BusLoop(bus, 0x20, 0x10).read().gains
         assert accepted.Kp == pytest.approx(58.5, rel=0.05) and accepted.Ti == pytest.approx(2.1, rel=0.1)
 
-        job = http.post("/loops/TIC-101/retune", json={"requested_by": "me", "method": "setpoint"})
+        job = http.post("/loops/TIC-101/retune", json={"by": "me", "method": "setpoint"})
         assert job.status_code == 202
         until(lambda: http.get(job.headers["location"]).json()["stage"] == "pulses")
     demo.press(INTERRUPT * 2)

@@ -43,14 +43,17 @@ def test_a_controller_stopped_by_another_is_looked_after_until_it_is_started(her
     assert (job["state"], job["reason"], job["restored"]) == ("failed", "node_not_operational", None)
     shown = here.http.get(f"/loops/{TAG}").json()
     assert shown["live"]["node_state"] == "node 20h (32) is pre-operational"
-    assert (shown["not_confirmed_home"]["job"], shown["not_confirmed_home"]["reason"]) == (url, "node_not_operational")
+    assert (shown["restore_unconfirmed"]["job"], shown["restore_unconfirmed"]["reason"]) == (
+        url,
+        "node_not_operational",
+    )
     ready = here.http.get("/readyz")
     detail = ready.json()["parts"][f"loop {TAG}"]["detail"]
     assert ready.status_code == 503 and "node 20h (32) is pre-operational" in detail and "start it (NMT)" in detail
 
     nmt(here, NmtCommand.START)
     until = time.monotonic() + 60
-    while here.http.get(f"/loops/{TAG}").json()["not_confirmed_home"] and time.monotonic() < until:
+    while here.http.get(f"/loops/{TAG}").json()["restore_unconfirmed"] and time.monotonic() < until:
         time.sleep(0.2)
     assert here.is_home() and here.job(url)["restored"]["mode"] == "automatic"
     assert here.job(url)["state"] == "failed"

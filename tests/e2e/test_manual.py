@@ -66,7 +66,7 @@ def test_it_gets_gains_that_were_never_tried_and_takes_them_without_leaving_manu
     job = here.finished(url)
     assert job["state"] == "proposed", (job["reason"], job["detail"])
     assert job["mode_found"] == "manual"
-    assert job["tried"] is False and any("never tried" in note for note in job["notes"])
+    assert job["tested_on_loop"] is False and any("never tested" in note for note in job["notes"])
     samples = here.http.get(f"{url}/samples").json()
     assert set(samples["mode"]) == {int(Mode.MANUAL)}
     assert max(abs(mv - home[1]) for mv in samples["mv"]) <= shown["largest_mv_move_pct"] * (1.0 + 1e-5)

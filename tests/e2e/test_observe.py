@@ -90,7 +90,7 @@ def test_what_an_operator_does_gives_gains_that_are_right_on_the_plant(bus: str,
 
         job = here.finished(here.retune(**found["retune"]))
         assert job["state"] == "proposed", (job["reason"], job["detail"])
-        assert job["new_gains"]["Kp"] == pytest.approx(gains.Kp, rel=0.01) and job["after"]["settled"]
+        assert job["new_gains"]["Kp"] == pytest.approx(gains.Kp, rel=0.01) and job["step_after"]["settled"]
         assert here.is_home()
         here.http.post(f"{job['url']}/accept").raise_for_status()
         known = here.http.get(f"/loops/{TAG}").json()["knowledge"]

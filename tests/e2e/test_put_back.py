@@ -1,5 +1,5 @@
-"""The old gains come back by themselves on a live bus: after an acceptance the plant's gain rises, and PV oscillates
-with swings that grow.
+"""The previous gains come back by themselves on a live bus: after an acceptance the plant's gain rises, and PV
+oscillates with swings that grow.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ def test_gains_under_which_an_oscillation_grows_are_taken_back(here: Plantsite) 
     assert here.finished(url)["state"] == "proposed"
     assert here.http.post(f"{url}/accept", json={"by": "A. Lind"}).status_code == 200
     accepted = here.state().gains
-    here.until_watched(url, lambda watch: watch["not_heard"] is None)
+    here.until_watched(url, lambda watch: watch["no_data"] is None)
     here.write("plant_gain", RISES_TO)
     here.write("plant_disturbance", 0.02)
 
-    watch = here.until_watched(url, lambda watch: watch["trouble"] and watch["trouble"]["put_back"] is not None)
+    watch = here.until_watched(url, lambda watch: watch["trouble"] and watch["trouble"]["rolled_back"] is not None)
     trouble = watch["trouble"]
-    assert (trouble["kind"], trouble["put_back"], trouble["why_not"]) == ("growing_oscillation", True, None), trouble
+    assert (trouble["kind"], trouble["rolled_back"], trouble["reason"]) == ("growing_oscillation", True, None), trouble
     assert "PV oscillates under the new gains with a period of 3." in trouble["text"]
     assert here.job(url)["state"] == "rolled_back" and watch["end"] == "rolled_back"
     state = here.state()
     assert (state.gains.Kp, state.gains.Ti) == pytest.approx((LOOP.kp, LOOP.ti)) and state.gains != accepted
     assert here.is_home()
     latest = here.http.get("/audit").json()[0]
-    assert (latest["what"], latest["said_by"], latest["subject"]) == ("rollback", "watch after acceptance", job_of(url))
+    assert (latest["what"], latest["by"], latest["subject"]) == ("rollback", "watch after acceptance", job_of(url))
 
 
 def job_of(url: str) -> str:

@@ -46,9 +46,9 @@ def test_a_live_loop_is_retuned_and_the_change_taken_back(site: Callable[[Case],
     assert job["predicted"]["Ms"] <= 2.0
     if method != "five-stage":
         assert job["predicted"]["Ms"] == pytest.approx(1.6, abs=0.02) and job["evidence"]["uncertainty"] < 0.1
-        assert job["verification"]["fit_pct"] > 95 and job["predicted_before"]
+        assert job["verification"]["fit_pct"] > 95 and job["predicted_previous"]
         assert job["plant_time_s"] < 12 * case.Pu_s + case.t95_s
-    assert job["old_gains"]["Kp"] == pytest.approx(case.kp) and job["restored"]["mode"] == "automatic"
+    assert job["previous_gains"]["Kp"] == pytest.approx(case.kp) and job["restored"]["mode"] == "automatic"
     assert here.is_home()
     samples = here.http.get(f"{url}/samples?stage=verify").json()
     assert len(samples["t_s"]) > 100 and set(samples["stage"]) == {"verify"}
@@ -80,7 +80,7 @@ def test_another_method_on_a_model_of_the_jobs_own_samples(method: str, site: Ca
     gains = job["new_gains"]
     assert gains["Td"] > 0 and gains["Tf"] > 0
     assert job["predicted"]["Ms"] < 2
-    assert job["after"]["settled"] and job["after"]["IAE"] < job["before"]["IAE"]
+    assert job["step_after"]["settled"] and job["step_after"]["IAE"] < job["step_before"]["IAE"]
     assert here.is_home()
 
 

@@ -33,9 +33,9 @@ def test_what_is_seen(site: GatewaySite) -> None:
     assert (found["gains"]["Kp"], found["gains"]["Ti"]) == (pytest.approx(CASE.kp), pytest.approx(CASE.ti))
     with viewing(site.url) as viewer:
         row = viewer.row(LOOP, lambda row: row["pv"] is not None)
-        assert row["host"] == OTHER and row["age_s"] < 3.0
+        assert row["gateway"] == OTHER and row["age_s"] < 3.0
         before = row["pv"], row["age_s"]
-        assert viewer.row(LOOP, lambda row: (row["pv"], row["age_s"]) != before)["not_heard"] is None
+        assert viewer.row(LOOP, lambda row: (row["pv"], row["age_s"]) != before)["no_data"] is None
     gateways = {each["name"]: each for each in site.get("/gateways")}
     other = gateways[OTHER]
     assert (other["answers"], other["loops"], other["url"]) == (True, 1, "https://gw-2.example")
@@ -49,7 +49,7 @@ def test_a_test_is_followed_and_aborted(site: GatewaySite) -> None:
     job = site.retune()
     with viewing(site.url, f"/live?loops={LOOP}") as viewer:
         seen = viewer.until("jobs", lambda found: any((each["progress"] or 0.0) > 0.05 for each in found["jobs"]))
-        assert seen["jobs"][0]["host"] == OTHER and seen["jobs"][0]["remaining_plant_time_s"] > 0.0
+        assert seen["jobs"][0]["gateway"] == OTHER and seen["jobs"][0]["remaining_plant_time_s"] > 0.0
         viewer.row(LOOP, lambda row: row["under_test"])
         assert site.post(f"{job}/abort", by="A. Lind").status_code == 202
         viewer.until("job", lambda event: event["data"].get("state") == "aborted")
@@ -81,7 +81,7 @@ def test_the_other_gateway_is_killed(site: GatewaySite) -> None:
     answer = site.post(f"{job}/accept", by="A. Lind")  # it was there just now: waited for, then withdrawn
     assert answer.status_code == 503 and answer.json()["reason"] == "gateway_lost", answer.text
     with viewing(site.url) as viewer:
-        row = viewer.row(LOOP, lambda row: row["not_heard"] and f"gateway {OTHER} does not answer" in row["not_heard"])
+        row = viewer.row(LOOP, lambda row: row["no_data"] and f"gateway {OTHER} does not answer" in row["no_data"])
         assert row["pv"] is None
     error = site.get(f"/loops/{LOOP}")["live_error"]
     assert error["reason"] == "gateway_lost" and OTHER in error["detail"]
@@ -99,12 +99,12 @@ def test_the_database_is_restarted(site: GatewaySite, database: Server) -> None:
         viewer.row(LOOP, lambda row: row["pv"] is not None)
         database.stop()
         away = "the database, by which it is seen, does not answer"
-        row = viewer.row(LOOP, lambda row: row["not_heard"] and away in row["not_heard"])
+        row = viewer.row(LOOP, lambda row: row["no_data"] and away in row["no_data"])
         assert row["pv"] is None
         assert site.post(f"{job}/accept", by="A. Lind").status_code == 503
         assert site.kp() == pytest.approx(CASE.kp), "the loop goes on"
         database.start()
-        assert viewer.row(LOOP, lambda row: row["pv"] is not None)["not_heard"] is None
+        assert viewer.row(LOOP, lambda row: row["pv"] is not None)["no_data"] is None
     patiently(lambda: site.post(f"{job}/accept", by="A. Lind").status_code in (200, 409))
     assert site.get(job)["state"] == "accepted"
     assert site.post(f"{job}/rollback", by="A. Lind").status_code == 200

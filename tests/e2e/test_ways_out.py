@@ -139,15 +139,15 @@ def test_mv_at_its_limit_in_mid_pulse(here: Plantsite) -> None:
 
 
 def test_the_set_point_of_an_inner_loop_is_not_pulsed(here: Plantsite) -> None:
-    answer = here.http.post("/loops/INNER/retune", json={"requested_by": "me", "method": "setpoint"})
+    answer = here.http.post("/loops/INNER/retune", json={"by": "me", "method": "setpoint"})
     assert (answer.status_code, answer.json()["reason"]) == (409, "setpoint_is_driven")
     assert f"comes from {TAG}" in answer.json()["detail"] and "to local set-point" in answer.json()["detail"]
     assert here.http.get("/loops/INNER/jobs").json() == []
 
 
 def test_what_is_refused_at_once(here: Plantsite) -> None:
-    unknown = here.http.post("/loops/NOBODY/retune", json={"requested_by": "me"})
-    contradicting = here.http.post(f"/loops/{TAG}/retune", json={"requested_by": "me", "mv_low": 60, "mv_high": 40})
+    unknown = here.http.post("/loops/NOBODY/retune", json={"by": "me"})
+    contradicting = here.http.post(f"/loops/{TAG}/retune", json={"by": "me", "mv_low": 60, "mv_high": 40})
     nan = here.http.post(
         f"/loops/{TAG}/retune", content='{"sp_deviation": NaN}', headers={"content-type": "application/json"}
     )
@@ -196,7 +196,7 @@ def test_aborted_by_the_operator_in_each_stage(here: Plantsite, stage: str) -> N
 
 def test_busy_then_aborted_by_the_operator(here: Plantsite) -> None:
     url = here.in_stage(EARLY["fast"])
-    busy = here.http.post(f"/loops/{TAG}/retune", json={"requested_by": "me"})
+    busy = here.http.post(f"/loops/{TAG}/retune", json={"by": "me"})
     assert busy.status_code == 409 and busy.json()["job"] == url
     assert here.http.post(f"{url}/abort").status_code == 202
     assert ended(here, url) == ("aborted", "operator")
@@ -217,7 +217,7 @@ def test_a_bus_that_goes_down(here: Plantsite, stage: str) -> None:
         link("up")
     # what is noticed first depends on where the outage meets us: the bus, the silence, a controller that has gone back
     state, reason = ended(here, url)
-    assert state == "failed" and reason in ("bus_lost", "node_lost", "samples_lost", "device_went_back")
+    assert state == "failed" and reason in ("bus_lost", "node_lost", "samples_lost", "session_ended_by_device")
     assert here.is_home()
 
 

@@ -342,13 +342,13 @@ def pv_false(by: float | None) -> Injection:
         reason = stand.site.job(url)["reason"]
         if reason not in (Reason.PV_FROZEN, Reason.BAD_SAMPLE):
             stand.defects.append(f"PV was false, and the job ended as {reason}")
-        answer = stand.site.http.post(f"/loops/{TAG}/retune", json={"requested_by": "operator"})
+        answer = stand.site.http.post(f"/loops/{TAG}/retune", json={"by": "operator"})
         if (answer.status_code, answer.json().get("reason")) != (409, Reason.NOT_ACKNOWLEDGED):
             stand.defects.append(f"the next retune was answered with {answer.status_code} {answer.text}")
         if answer.status_code == 202:
             stand.site.http.post(f"{answer.headers['location']}/abort")
             stand.site.finished(answer.headers["location"])
-        stand.site.http.post(f"/loops/{TAG}/dismiss", json={"by": "operator"})
+        stand.site.http.post(f"/loops/{TAG}/acknowledge", json={"by": "operator"})
 
     return contextmanager(inject)
 

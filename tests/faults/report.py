@@ -45,7 +45,7 @@ word. Unsafe ends and their jobs would stand here by name:{bad}
 
 The loop is model 14 of the 50, sampled at {ts:g} s, run at {pace:g} times real time, slower where a stage is short. A
 run in which the machine itself stood still for 0.4 s is repeated, twice at most, unless its end is bad: the heartbeat
-time is 1.5 s, and `device_went_back` with no fault in sight is such a machine's.
+time is 1.5 s, and `session_ended_by_device` with no fault in sight is such a machine's.
 """
 
 EARLIER = """
@@ -54,8 +54,8 @@ EARLIER = """
 
 WATCH = """## Monitoring after acceptance
 
-Gains are accepted, with the old gains to be put back without a person ([watch.md](watch.md)). A load that MV cannot
-balance then takes PV out of its limits, and the watch is to put the old gains back. A fault strikes
+Gains are accepted, with the automatic rollback ([watch.md](watch.md)). A load that MV cannot
+balance then takes PV out of its limits, and the previous gains are to be put back. A fault strikes
 
 {moments}
 

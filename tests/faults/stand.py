@@ -83,7 +83,7 @@ class Stand:
         if database == "postgresql":
             self.server = _server(stack)
             self.database = self.server.database()
-            served_with = ("--database", self.database, "--host", "gw-1")
+            served_with = ("--database", self.database, "--gateway", "gw-1")
         if needs.small_disk:
             _mount(stack, folder / "data")
         if needs.own_clock:

@@ -22,7 +22,7 @@ from tests.faults.watch_ending import OUTSIDE, WATCHED, WRITING
 pytestmark = pytest.mark.timeout(200)
 
 PROPOSED = "proposed None"
-SILENT = ("failed node_lost", "failed samples_lost", "failed device_went_back")
+SILENT = ("failed node_lost", "failed samples_lost", "failed session_ended_by_device")
 EXPECTED: dict[tuple[str, str], tuple[str, ...]] = {
     ("service-killed", "zn_pi"): (PROPOSED,),
     ("service-killed", "manual-up"): (PROPOSED,),

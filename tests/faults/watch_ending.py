@@ -1,4 +1,4 @@
-"""A fault while a loop is watched after an acceptance, or while the watch puts the old gains back: how it ends.
+"""A fault while a loop is watched after an acceptance, or while the watch puts the previous gains back: how it ends.
 
 What goes wrong under the new gains is a load that MV cannot balance: PV leaves its limits for good.
 """
@@ -21,7 +21,7 @@ WATCHED, OUTSIDE, WRITING = "watched", "outside", "writing"
 MOMENTS = {
     WATCHED: "before anything goes wrong, which it does as soon as the fault has struck",
     OUTSIDE: "PV has been outside its limits for a second, of the three that the watch waits",
-    WRITING: "the watch has opened its session to write the old gains",
+    WRITING: "the watch has opened its session to write the previous gains",
 }
 LOAD_PCT = 200.0
 OUTSIDE_S = 1.0
@@ -60,11 +60,11 @@ def watch_ending(stand: Stand, name: str, inject: Injection, moment: str, databa
     bad = unsafe(seen, home, at_rest=True)
     defects = [*stand.defects, *_contradictions(stand, job, other)]
     _home_again(stand)
-    watch = job["watch"]
-    put_back = watch["trouble"] is not None and watch["trouble"]["put_back"]
-    why = watch["disarmed"] if watch["trouble"] is None else watch["trouble"]["why_not"]
+    watch = job["monitoring"]
+    put_back = watch["trouble"] is not None and watch["trouble"]["rolled_back"]
+    why = watch["auto_rollback_off"] if watch["trouble"] is None else watch["trouble"]["reason"]
     return Ending(
-        database, name, moment, job["state"], "put_back" if put_back else watch["end"], why and _undated(why), 1,
+        database, name, moment, job["state"], "rolled_back" if put_back else watch["end"], why and _undated(why), 1,
         round(time.monotonic() - struck, 1), 0, 0, 0, bad, home.words, defects,
         round(time.monotonic() - began, 1), round(stand.stalls.longest_s, 2),
     )  # fmt: skip
@@ -78,7 +78,7 @@ def _accepted(stand: Stand) -> str:
     answer = stand.site.http.post(f"{url}/accept", json={"by": "A. Lind"})
     assert answer.status_code == 200, answer.text
     stand.hub.new_job()
-    _until(lambda: stand.site.job(url)["watch"]["not_heard"] is None, SEEN_WITHIN_S, "the loop is heard")
+    _until(lambda: stand.site.job(url)["monitoring"]["no_data"] is None, SEEN_WITHIN_S, "the loop is heard")
     time.sleep(2.0)  # of wall time: the watch looks once a second, and is to have seen PV within its limits
     return url
 
@@ -91,13 +91,18 @@ def _go_wrong(stand: Stand) -> None:
 
 
 def _settled(stand: Stand, url: str, other: Home | None) -> dict[str, Any]:
-    """The job when the watch has decided, has ended or is disarmed for good, or as it is when nothing of it comes."""
+    """The job when the watch has decided, has ended or is auto_rollback_off for good, or as it is when nothing of it
+    comes."""
     give_up = time.monotonic() + SETTLED_WITHIN_S
     while True:
         job = stand.site.job(url)
-        trouble = job["watch"]["trouble"]
-        decided = trouble is not None and trouble["put_back"] is not None
-        if decided or job["watch"]["end"] is not None or (_out_of_automatic(other) and job["watch"]["disarmed"]):
+        trouble = job["monitoring"]["trouble"]
+        decided = trouble is not None and trouble["rolled_back"] is not None
+        if (
+            decided
+            or job["monitoring"]["end"] is not None
+            or (_out_of_automatic(other) and job["monitoring"]["auto_rollback_off"])
+        ):
             return stand.site.job(url)
         if time.monotonic() > give_up:
             return job
@@ -110,36 +115,36 @@ def _out_of_automatic(other: Home | None) -> bool:
 
 
 def _end(seen: Glance | None, new: Home, other: Home | None, job: dict[str, Any]) -> Home:
-    """How the loop must be: on the old gains where they were put back, else on those that it had.
+    """How the loop must be: on the previous gains where they were put back, else on those that it had.
 
     new: with the accepted gains.  other: as somebody else has left it meanwhile, whose word on gains is the last one.
     """
-    trouble = job["watch"]["trouble"]
+    trouble = job["monitoring"]["trouble"]
     if other is not None and other.Kp != new.Kp:
         return other
     if job["state"] == "rolled_back":
-        words = "the old gains" if other is None else f"the old gains, {other.words}"
+        words = "the previous gains" if other is None else f"the previous gains, {other.words}"
         return replace(other or new, Kp=HOME.Kp, Ti=HOME.Ti, words=words)
     if other is not None:
         return other
-    in_doubt = trouble is not None and trouble["why_not"] is not None and "read the loop" in trouble["why_not"]
+    in_doubt = trouble is not None and trouble["reason"] is not None and "read the loop" in trouble["reason"]
     if in_doubt and seen is not None and same(seen.Kp, HOME.Kp):
-        return replace(HOME, words="the old gains, in doubt")
+        return replace(HOME, words="the previous gains, in doubt")
     return replace(new, words="the new gains, in doubt" if in_doubt else "the new gains")
 
 
 def _contradictions(stand: Stand, job: dict[str, Any], other: Home | None) -> list[str]:
     """What the service says of the end, and does not agree."""
-    watch, found = job["watch"], []
+    watch, found = job["monitoring"], []
     trouble = watch["trouble"]
     if trouble is None:
-        seen = watch["end"] is not None or (_out_of_automatic(other) and watch["disarmed"] is not None)
+        seen = watch["end"] is not None or (_out_of_automatic(other) and watch["auto_rollback_off"] is not None)
         return [] if seen else ["the watch has seen nothing"]
-    if trouble["put_back"] is None:
+    if trouble["rolled_back"] is None:
         found.append("the watch has not decided")
-    if bool(trouble["put_back"]) != (job["state"] == "rolled_back"):
-        found.append(f"put_back is {trouble['put_back']}, and the job {job['state']}")
-    kind = "rolled_back" if trouble["put_back"] else "suspect_gains"
+    if bool(trouble["rolled_back"]) != (job["state"] == "rolled_back"):
+        found.append(f"rolled_back is {trouble['rolled_back']}, and the job {job['state']}")
+    kind = "rolled_back" if trouble["rolled_back"] else "suspect_gains"
     try:
         _until(lambda: kind in _alarms(stand), SEEN_WITHIN_S, f"the alarm {kind}")
     except AssertionError as error:
@@ -158,7 +163,7 @@ def _alarms(stand: Stand) -> set[str]:
 
 
 def _home_again(stand: Stand) -> None:
-    """The old gains, by hand, for the next run."""
+    """The previous gains, by hand, for the next run."""
     for name, value in (("controller_staged_kp", LOOP.kp), ("controller_staged_ti", LOOP.ti)):
         stand.site.write(name, value)
     for command in (ParameterCommand.TRY, ParameterCommand.ACCEPT):

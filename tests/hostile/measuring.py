@@ -149,7 +149,7 @@ class Measuring:
                     self._note_end(job)
                     if job["state"] == "proposed":
                         self._asked("POST", f"{url}/rollback")
-                asked = {"requested_by": "me", "method": "five-stage"}
+                asked = {"by": "me", "method": "five-stage"}
                 answer = self._asked("POST", f"/loops/{tag}/retune", json=asked)
                 if answer is not None and answer.status_code == 202:
                     self._jobs[tag] = answer.headers["location"]
@@ -157,7 +157,7 @@ class Measuring:
 
     def _abort(self) -> None:
         while not self._over.is_set():
-            answer = self._asked("POST", f"/loops/{self._victim}/retune", json={"requested_by": "me"})
+            answer = self._asked("POST", f"/loops/{self._victim}/retune", json={"by": "me"})
             if answer is None or answer.status_code != 202:
                 self._over.wait(0.2)
                 continue

@@ -27,7 +27,7 @@ async function rehearsed(tag: string, body: components["schemas"]["FastRetune"])
 
 const loops = await client.GET("/loops");
 if (loops.error) throw new Error(loops.error.detail);
-const gains = await rehearsed(loops.data[0]!.tag, { method: "fast", dry_run: true, ms: 1.4 });
+const gains = await rehearsed(loops.data[0]!.tag, { method: "fast", dry_run: true, Ms: 1.4 });
 console.log(loops.data[0]!.tag, gains.Kp, gains.Ti);
 
 const tuned = await client.POST("/tunings", { body: { model: { K: 0.2, T_s: 2.4, L_s: 1.8 }, method: "simc" } });

@@ -153,7 +153,7 @@ def test_the_trial_of_gains_for_a_model_goes_down_where_that_is_permitted() -> N
     assert answer["outcome"] == "proposed", answer["detail"]
     sp = [sample.sp for sample in taken]
     assert max(sp) == 0.0 > min(sp)
-    assert 0.0 <= answer["after"]["overshoot_pct"] < 30.0 and answer["after"]["step"] < 0.0
+    assert 0.0 <= answer["step_after"]["overshoot_pct"] < 30.0 and answer["step_after"]["step"] < 0.0
 
 
 @pytest.mark.parametrize("step_in", [0.25, 1.0])

@@ -145,10 +145,10 @@ def test_a_heater_that_settles_in_time_and_moves_MV_no_further(method: str) -> N
     }
     answer = rehearse(plant, method=method, settling_s=100.0, mv_peak=4.0)
     assert answer["outcome"] == "proposed", answer["detail"]
-    compared, chosen = answer["comparison"], answer["chosen"]
+    compared, chosen = answer["comparison"], answer["design"]
     assert (compared["settling_s_asked"], compared["mv_peak_asked"], compared["Ms_asked"]) == (100.0, 4.0, 1.6)
     assert (chosen["settling_s"], chosen["mv_peak"]) == (100.0, 4.0) and 1.15 < chosen["Ms"] < 1.35
-    assert compared["after"]["setpoint"]["settling_s"] <= 100.01 and compared["after"]["setpoint"]["mv_peak"] <= 4.0004
+    assert compared["new"]["setpoint"]["settling_s"] <= 100.01 and compared["new"]["setpoint"]["mv_peak"] <= 4.0004
     assert abs(true_Ms(plant, answer["new_gains"]) - chosen["Ms"]) < 0.03
     gains = GainsView.model_validate(answer["new_gains"]).gains()
     true = step_figures(TransferFunction((0.8,), (120.0, 1.0), 15.5), gains, band=0.05)

@@ -87,7 +87,7 @@ def test_a_load_step_in_mid_relay_is_found(tmp_path: Path, size: float) -> None:
 
 
 def test_without_a_load_none_is_found(tmp_path: Path) -> None:
-    job, _ = proposal(tmp_path, 0.0, 0.0, ms=1.4)
+    job, _ = proposal(tmp_path, 0.0, 0.0, Ms=1.4)
     assert job["state"] == "proposed", job["detail"]
     assert job["evidence"]["loads"] == [] and not job["evidence"]["drift"]
     gains = Gains(job["new_gains"]["Kp"], job["new_gains"]["Ti"])
@@ -96,14 +96,14 @@ def test_without_a_load_none_is_found(tmp_path: Path) -> None:
 
 def test_gains_for_another_Ms_are_tried_without_another_relay(tmp_path: Path) -> None:
     model = {"num": [K], "den": [T, 1.0], "dead_time_s": L}
-    job, samples = proposal(tmp_path, 0.0, 0.0, amplitude_pct=None, start="design", model=model, ms=1.4)
+    job, samples = proposal(tmp_path, 0.0, 0.0, amplitude_pct=None, start="design", model=model, Ms=1.4)
     assert job["state"] == "proposed", job["detail"]
     assert int(Mode.EXPERIMENT) not in samples["mode"]
     assert [stage["stage"] for stage in job["stages"]] == ["preflight", "design", "verify"]
     gains = Gains(job["new_gains"]["Kp"], job["new_gains"]["Ti"])
     assert margins(FOPDT(K, T, L + TS / 2), gains).Ms == pytest.approx(1.4, abs=0.01)
-    assert job["after"]["settled"] and job["after"]["overshoot_pct"] < 40
-    assert job["predicted_before"] and job["evidence"] is None and job["before"] is None
+    assert job["step_after"]["settled"] and job["step_after"]["overshoot_pct"] < 40
+    assert job["predicted_previous"] and job["evidence"] is None and job["step_before"] is None
     assert job["restored"]["gains"]["Kp"] == pytest.approx(0.2) and job["restored"]["on_trial"] is False
 
 
@@ -112,12 +112,12 @@ def test_a_job_with_a_settling_time_and_a_movement_of_MV(tmp_path: Path) -> None
     asked = {"settling_s": 14.0, "mv_peak": 1.5}
     job, _ = proposal(tmp_path, 0.0, 0.0, **asked)
     assert job["state"] == "proposed" and job["request"]["settling_s"] == 14.0 and job["request"]["mv_peak"] == 1.5
-    compared, reached = job["comparison"], job["comparison"]["after"]["setpoint"]
+    compared, reached = job["comparison"], job["comparison"]["new"]["setpoint"]
     assert (compared["settling_s_asked"], compared["mv_peak_asked"]) == (14.0, 1.5)
     assert reached["settling_s"] <= 14.0014 and reached["mv_peak"] <= 1.50015
-    assert job["chosen"]["Ms"] < 1.55 and job["chosen"]["settling_s"] == 14.0
+    assert job["design"]["Ms"] < 1.55 and job["design"]["settling_s"] == 14.0
     gains = GainsView.model_validate(job["new_gains"]).gains()
-    assert margins(FOPDT(K, T, L + 0.5 * TS), gains).Ms == pytest.approx(job["chosen"]["Ms"], abs=0.05)
+    assert margins(FOPDT(K, T, L + 0.5 * TS), gains).Ms == pytest.approx(job["design"]["Ms"], abs=0.05)
     never, _ = proposal(tmp_path / "never", 0.0, 0.0, settling_s=3.0)
     assert (never["state"], never["reason"]) == ("refused", "not_possible")
     assert "3 s was asked for: ask for at least" in never["detail"] and never["advice"]

@@ -43,7 +43,7 @@ def test_a_proposal_tells_Ms_of_the_present_and_of_the_new_gains(
     assert found is not None and found.source is FindingSource.JOB and found.job == job["url"]
     assert found.Ms is not None and found.uncertainty is not None and 0.0 < found.uncertainty < 0.1
     assert abs(found.Ms - true_Ms(OLD)) < found.uncertainty + 0.005
-    assert found.Ms == pytest.approx(job["comparison"]["before"]["Ms"], abs=0.005)
+    assert found.Ms == pytest.approx(job["comparison"]["previous"]["Ms"], abs=0.005)
     assert found.pv_range is not None and found.mv_range is not None
     assert (found.pv_range.low, found.pv_range.high) == pytest.approx(
         (min(samples["pv"]), max(samples["pv"])), abs=1e-4
@@ -59,5 +59,5 @@ def test_a_proposal_tells_Ms_of_the_present_and_of_the_new_gains(
 
 def test_a_trial_of_a_model_that_somebody_typed_in_tells_nothing(tmp_path: Path) -> None:
     model = {"num": [K], "den": [T, 1.0], "dead_time_s": L}
-    job, _ = proposal(tmp_path, 0.0, 0.0, amplitude_pct=None, start="design", model=model, ms=1.4)
+    job, _ = proposal(tmp_path, 0.0, 0.0, amplitude_pct=None, start="design", model=model, Ms=1.4)
     assert job["state"] == "proposed" and known(tmp_path, OLD) is None

@@ -103,7 +103,7 @@ def test_a_trial_that_shows_another_plant_drops_what_operation_has_shown(tmp_pat
     row, ran = here.finished()
     assert row.state == "proposed", row.detail
     assert "trial" in ran and ran.index("pulses") > ran.index("trial")
-    older = [each.older_plant for each in knowledge.read(here.store, TAG)]
+    older = [each.superseded for each in knowledge.read(here.store, TAG)]
     assert older[0] is not None and f"job {row.id} has tried gains from operation" in older[0]
     assert older[1:] == [None], "what the pulses have found is known now"
     assert job_knowledge.outdated_until_s(here.store, TAG) is not None

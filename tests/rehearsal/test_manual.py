@@ -42,8 +42,8 @@ def test_the_loop_gets_the_Ms_asked_and_never_leaves_manual(name: str, part: flo
     assert {sample.sp for sample in taken} == {0.0}
     assert taken[-1].mv == 0.0
     assert max(abs(sample.pv) for sample in taken) <= answer["input"]["sp_deviation"]
-    assert answer["verification"] is None and answer["after"] is None
-    assert "never tried" in answer["notes"][0]
+    assert answer["verification"] is None and answer["step_after"] is None
+    assert "never tested" in answer["notes"][0]
 
 
 @pytest.mark.parametrize("name", RETURNING)

@@ -21,7 +21,7 @@ from loopwright.service.inputs.config import LoopConfig, parse_site
 from loopwright.service.inputs.request import retune_request
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.states.job_state import JobState
-from loopwright.service.store.retunes import Part
+from loopwright.service.store.batches import Part
 from loopwright.service.store.store import Store
 from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.gains import Gains
@@ -72,12 +72,12 @@ def test_gains_that_the_method_itself_has_proposed_are_kept(tmp_path: Path, meth
     assert (job["state"], job["reason"]) == ("no_gain", "no_gain"), job["detail"]
     assert job["detail"].startswith("Nothing asked for gets better by more than 5 %: the present gains are kept")
     assert "already tuned as well as asked" in job["advice"]
-    # nothing new was tried on the loop, and what was found is told
+    # nothing new was tested on the loop, and what was found is told
     assert "verify" not in [stage["stage"] for stage in job["stages"]]
     assert job["restored"]["gains"]["Kp"] == pytest.approx(own(method).Kp) and not job["restored"]["on_trial"]
     compared = job["comparison"]
     assert not compared["gain"] and compared["verdict"] == job["detail"]
-    assert compared["after"]["load"]["IAE"] == pytest.approx(compared["before"]["load"]["IAE"], rel=0.05)
+    assert compared["new"]["load"]["IAE"] == pytest.approx(compared["previous"]["load"]["IAE"], rel=0.05)
     assert job["model"] and job["new_gains"]["Kp"] == pytest.approx(own(method).Kp, rel=0.05)
     assert "the loop is already tuned as well as asked, the present gains stay" in title(JobView.model_validate(job))
     job_report(JobView.model_validate(job))
@@ -90,7 +90,7 @@ def test_gains_that_the_method_itself_has_proposed_are_kept(tmp_path: Path, meth
 def test_badly_tuned_loops_still_get_a_proposal(tmp_path: Path, method: str, present: Gains) -> None:
     job = retuned(tmp_path, present, method=method)
     assert job["state"] == "proposed", job["detail"]
-    before, after = job["comparison"]["before"], job["comparison"]["after"]
+    before, after = job["comparison"]["previous"], job["comparison"]["new"]
     assert job["comparison"]["gain"]
     assert after["load"]["IAE"] < before["load"]["IAE"] or after["Ms"] < before["Ms"] / 1.05
     assert "verify" in [stage["stage"] for stage in job["stages"]]
@@ -107,8 +107,8 @@ def test_gains_for_a_model_typed_in_are_not_tried_where_they_bring_nothing(tmp_p
     model = {"num": [2.0], "den": [6.0, 1.0], "dead_time_s": 1.5}
     kept = retuned(tmp_path / "kept", own("fast"), start="design", model=model)
     assert kept["state"] == "no_gain" and [stage["stage"] for stage in kept["stages"]] == ["preflight", "design"]
-    tried = retuned(tmp_path / "tried", own("fast"), start="design", model=model, ms=1.3)
-    assert tried["state"] == "proposed" and tried["after"]["settled"], tried["detail"]
+    tried = retuned(tmp_path / "tried", own("fast"), start="design", model=model, Ms=1.3)
+    assert tried["state"] == "proposed" and tried["step_after"]["settled"], tried["detail"]
 
 
 def test_a_dry_run_of_such_a_loop_is_rehearsed_and_says_so(tmp_path: Path) -> None:

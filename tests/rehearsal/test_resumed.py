@@ -66,7 +66,7 @@ def test_what_was_finished_is_not_run_again(cut: str, method: str) -> None:
     assert stopped.ended.reason is Reason.SERVICE_STOPPED
 
     second: list[Event] = []
-    for _ in range(600):  # the loop comes to rest under its old gains
+    for _ in range(600):  # the loop comes to rest under its previous gains
         here.step(())
     known = finished(stored(first))
     resumed = run(five_stage(FACTS, options, known), here, limits=RunLimits(), on_event=second.append)

@@ -84,7 +84,7 @@ def hold_is_not_looked_for(replace: Replace) -> None:
 
 
 def gains_are_not_compared(replace: Replace) -> None:
-    """The watch after acceptance puts the old gains back whatever the controller holds."""
+    """The watch after acceptance puts the previous gains back whatever the controller holds."""
 
     def same(*gains: object) -> bool:
         return True

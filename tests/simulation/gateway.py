@@ -234,7 +234,7 @@ class SimEngine:
 
 
 _EMPTIED = (
-    "webhook_deliveries", "watches", "sample_chunks", "events", "retune_loops", "retunes", "jobs", "loops", "audit",
+    "webhook_deliveries", "watches", "sample_chunks", "events", "batch_loops", "batches", "jobs", "loops", "audit",
 )  # fmt: skip
 
 

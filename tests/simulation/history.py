@@ -238,7 +238,7 @@ class World:
     def permit(self, row: Job) -> None:
         """A person decides: either set of the job may be the accepted one from now on."""
         proposed = None if row.result is None or row.result.new_gains is None else asdict(row.result.new_gains.gains())
-        for gains in (row.old_gains, proposed):
+        for gains in (row.previous_gains, proposed):
             if gains:
                 names = ("Kp", "Ti", "Td", "Tf", "b", "c")
                 self.invariants.permitted.append(Parameters(*(real32(float(gains[name])) for name in names)))

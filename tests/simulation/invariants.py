@@ -443,7 +443,7 @@ class Invariants:
         """The rows of a gateway that is up at the end: a job that has had its loop held says so, and no other does."""
         restarted = any(kind == "restart" for _, kind in self.hands)
         for row in rows:
-            if row.session in self.holds and not (row.false_pv or row.look_after or restarted):
+            if row.session in self.holds and not (row.false_pv or row.restore_unconfirmed or restarted):
                 self.say(f"the loop was held, and its job does not say so: {row.state} {row.reason} {row.detail}")
             if row.false_pv and not self.plant.sensor.was_false:
                 self.say(f"a job says that PV was false, and it was not: {row.detail}")

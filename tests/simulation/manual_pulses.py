@@ -134,7 +134,7 @@ def pv_limit(world: World, gateway: Gateway) -> None:
     _later(world, AWAY_S, setattr, world.plant.device.plants[0], "disturbance", 0.0)
 
 
-SILENT = ("node_lost", "samples_lost", "device_went_back")
+SILENT = ("node_lost", "samples_lost", "session_ended_by_device")
 STRIKES: dict[str, tuple[Strike, tuple[str, ...]]] = {
     "aborted": (aborted, ("aborted operator",)),
     "defect": (defect, ("failed internal",)),

@@ -69,7 +69,7 @@ def test_a_watched_loop_gets_the_old_gains_back_or_a_reason_why_not() -> None:
         found: list[AcceptanceWatch] = []
         made.at_the_end.append(partial(_take_watches, made, found))
         assert not made.run().bad
-        ends |= {(each.trouble and each.trouble.kind, each.trouble and each.trouble.put_back) for each in found}
+        ends |= {(each.trouble and each.trouble.kind, each.trouble and each.trouble.rolled_back) for each in found}
     put_back = {TroubleKind.PV_OUTSIDE_LIMITS, TroubleKind.GROWING_OSCILLATION}
     assert ends >= {(kind, True) for kind in put_back} | {(TroubleKind.PV_OUTSIDE_LIMITS, False), (None, None)}
 

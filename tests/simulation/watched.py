@@ -123,8 +123,8 @@ def watched(world: World, gateway: Gateway, upset: Callable[[], None], until_s: 
 
 
 def in_turn(world: World, gateway: Gateway, row: Job) -> None:
-    """Old gains that the watch has put back came right after the accepted ones, of all that the controller held: they
-    were written, and not over gains that somebody else had set."""
+    """Previous gains that the watch has put back came right after the accepted ones, of all that the controller held:
+    they were written, and not over gains that somebody else had set."""
     found = watches.of_jobs(gateway.store, [row.id]).get(row.id)
     if found is None or found.trouble is None:
         return
@@ -141,13 +141,13 @@ def agrees(world: World, gateway: Gateway) -> None:
         watch = watches.of_jobs(gateway.store, [row.id]).get(row.id)
         if watch is None or watch.trouble is None:
             continue
-        put_back = bool(watch.trouble.put_back)
+        put_back = bool(watch.trouble.rolled_back)
         if put_back and row.state is not JobState.ROLLED_BACK:
             world.invariants.say(f"the watch says that it put gains back, and the job is {row.state}")
-        if watch.trouble.put_back is None and gateway.is_up and row.state is JobState.ACCEPTED:
+        if watch.trouble.rolled_back is None and gateway.is_up and row.state is JobState.ACCEPTED:
             world.invariants.say("the watch has not decided: in the time it has for it")
         if put_back or row.state is JobState.ACCEPTED:
-            world.simulation.note("watch", f"{watch.trouble.kind}, put back {put_back}: {watch.trouble.why_not}")
+            world.simulation.note("watch", f"{watch.trouble.kind}, put back {put_back}: {watch.trouble.reason}")
     world.simulation.note("watch", f"over, {BY}")
 
 

@@ -24,12 +24,12 @@ def fleet(kind: str) -> None:
         wait_healthy(_ALL)
         tell(f"up          all nine healthy after {time.monotonic() - started:.1f} s")
         for door in ("LOOPWRIGHT_PORT", _DOOR_B):
-            found = {loop["tag"]: loop["host"] for loop in ask("/loops", port=door)}
+            found = {loop["tag"]: loop["gateway"] for loop in ask("/loops", port=door)}
             check(f"both loops are shown at {door}", found == {TAG: "gateway-a", "TIC-201": "gateway-b"}, str(found))
-        job = ask(f"/loops/{TAG}/retune", {"requested_by": "gateway b"}, port=_DOOR_B)
+        job = ask(f"/loops/{TAG}/retune", {"by": "gateway b"}, port=_DOOR_B)
         told = ended(job["url"], port=_DOOR_B)
         tell(f"posted at B job on {TAG}, run by {told['host']}: {told['state']}")
-        check("run by the gateway that has the bus", (told["host"], told["state"]) == ("gateway-a", "proposed"))
+        check("run by the gateway that has the bus", (told["gateway"], told["state"]) == ("gateway-a", "proposed"))
         expect("A's own log says so", logs("service"), f"job started, attempt 1 job={job['id']}")
         check("B's does not", f"job started, attempt 1 job={job['id']}" not in logs("service-b"), logs("service-b"))
         tell("memory      " + memory(_ALL))

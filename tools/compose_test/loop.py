@@ -47,7 +47,7 @@ def at_rest_soon() -> None:
 def in_mid_stage() -> str:
     """A job in its relay stage, the plant slow enough for that to last; its URL."""
     pace(SLOW)
-    url = str(ask(f"/loops/{TAG}/retune", {"requested_by": "compose-test"})["url"])
+    url = str(ask(f"/loops/{TAG}/retune", {"by": "compose-test"})["url"])
 
     def there() -> bool:
         job = ask(url)

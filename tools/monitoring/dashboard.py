@@ -15,16 +15,16 @@ Panels = tuple[tuple[str, str, str, str], ...]
 """Title, unit, expression and legend of each panel."""
 NOW: Panels = (
     ("Loops", "short", "sum(loopwright_loops)", ""),
-    ("Loops not confirmed home", "short", "sum(loopwright_loops_looked_after)", ""),
-    ("Alarms of the worst level", "short", 'sum(loopwright_alarms{level="1"})', ""),
+    ("Loops not confirmed restored", "short", "sum(loopwright_loops_restore_unconfirmed)", ""),
+    ("Alarms of the highest priority", "short", 'sum(loopwright_alarms{priority="1"})', ""),
     ("Tests that run", "short", 'sum(loopwright_jobs{state="running"})', ""),
     ("Proposals that wait", "short", "sum(loopwright_proposals_waiting)", ""),
     ("Buses that are heard", "short", "sum(loopwright_listening_up)", ""),
 )
 LOOPS: Panels = (
     ("Jobs by state", "short", "sum by (state) (loopwright_jobs)", "{{state}}"),
-    ("Alarms by level", "short", "sum by (level) (loopwright_alarms)", "level {{level}}"),
-    ("Frames heard", "cps", "sum by (bus) (rate(loopwright_frames_heard_total[5m]))", "{{bus}}"),
+    ("Alarms by priority", "short", "sum by (priority) (loopwright_alarms)", "priority {{priority}}"),
+    ("Frames received", "cps", "sum by (bus) (rate(loopwright_frames_received_total[5m]))", "{{bus}}"),
     ("Samples lost in tests", "short", "sum by (bus) (increase(loopwright_samples_lost_total[5m]))", "{{bus}}"),
     ("SDO requests sent again", "short", "sum by (bus) (increase(loopwright_sdo_retries_total[5m]))", "{{bus}}"),
     (

@@ -1,8 +1,8 @@
 """The comparison of old and new gains on one model, and the conclusion whether the new gains are an improvement.
 
 The user asks for bounds of robustness (Ms and others) and, under these, for the smallest J, the criterion that the
-procedure minimises. New gains are an improvement where they restore a bound that the old gains violate, or lower J, by
-more than `MIN_GAIN` each; they are none where no figure shown is better.
+procedure minimises. New gains are an improvement where they restore a bound that the previous gains violate, or lower
+J, by more than `MIN_GAIN` each; they are none where no figure shown is better.
 """
 
 from __future__ import annotations
@@ -150,22 +150,22 @@ class RobustnessBounds:
 class Comparison:
     """The comparison of old and new gains.
 
-    before, after: the figures of the old and of the new gains on the same model.
+    previous, new: the figures of the old and of the new gains on the same model.
     Ms_asked: the largest permitted Ms.
     settling_s_asked, mv_peak_asked, noise_gain_asked: the largest permitted ones, see `RobustnessBounds`; None where
     none was asked for.
     criterion: the criterion J in words.
-    J_before, J_after: the values of J, the lower the better; None where the loop is not stable or leaves an offset.
+    J_previous, J_new: the values of J, the lower the better; None where the loop is not stable or leaves an offset.
     gain: True if what was asked for improves by more than 5 %.
     verdict: the conclusion in a sentence.
     """
 
-    before: LoopPerformance
-    after: LoopPerformance
+    previous: LoopPerformance
+    new: LoopPerformance
     Ms_asked: float
     criterion: str
-    J_before: float | None
-    J_after: float | None
+    J_previous: float | None
+    J_new: float | None
     gain: bool
     verdict: str
     settling_s_asked: float | None = None
@@ -248,8 +248,8 @@ def weighted_IAE(found: LoopPerformance, setpoint: float, load: float, share: fl
 
 
 def IAE_over_present(before: LoopPerformance, after: LoopPerformance) -> tuple[float | None, float | None]:
-    """The weighted IAE of old and new gains, divided by the IAE of the old gains, or of the new ones where the old have
-    none."""
+    """The weighted IAE of old and new gains, divided by the IAE of the previous gains, or of the new ones where the
+    old have none."""
     for each in (before, after):
         if each.setpoint and each.load and each.setpoint.IAE and each.load.IAE:
             over = each.setpoint.IAE, each.load.IAE

@@ -100,8 +100,8 @@ def is_unexplained(check: ControllerCheck) -> bool:
 def check_law_at_rest(facts: Facts, listened: Trace) -> None:
     """Raises Refused, CONTROLLER_MISMATCH, where the time at rest shows that the controller has another law than it is
     said to have. listened: the samples at rest, in automatic."""
-    check = _checked(facts, listened, facts.old_gains)
-    if check.other is not None and (text := mismatch_of(check, facts.old_gains, facts.T95_s)) is not None:
+    check = _checked(facts, listened, facts.previous_gains)
+    if check.other is not None and (text := mismatch_of(check, facts.previous_gains, facts.T95_s)) is not None:
         raise Refused(Reason.CONTROLLER_MISMATCH, f"at rest {text}")
 
 

@@ -34,7 +34,7 @@ class Facts:
     T95_s: the time in which the plant covers 95 % of a step, s, as given by the user.
     mv_low, mv_high: the limits of MV, absolute, MV units.
     sp_deviation: the largest permitted set-point step, PV units, positive.
-    old_gains: the accepted gains.
+    previous_gains: the accepted gains.
     reverse: True when MV must fall as PV rises (positive plant gain).
     pv_low, pv_high: the limits within which PV must stay, absolute, PV units.
     mv_step_max: the largest jump of MV that the test may make from one sample to the next, MV units.
@@ -48,7 +48,7 @@ class Facts:
     mv_low: float
     mv_high: float
     sp_deviation: float
-    old_gains: Gains
+    previous_gains: Gains
     reverse: bool = True
     pv_low: float = -math.inf
     pv_high: float = math.inf

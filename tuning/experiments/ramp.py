@@ -150,7 +150,7 @@ def _home(facts: Facts, ramp: _Ramp) -> Plan[None]:
     if ramp.home is None or not ramp.away:
         return
     items: Items = (
-        Note(f"the set-point goes home within {facts.ramp_s(ramp.away):.4g} s"),
+        Note(f"the set-point returns within {facts.ramp_s(ramp.away):.4g} s"),
         SetSetpoint(ramp.home),
     )
     while ramp.away:

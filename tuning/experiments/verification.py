@@ -16,7 +16,7 @@ from loopwright.tuning.reasons import Reason, Refused
 def verification(
     facts: Facts, point: OperatingPoint, gains: Gains, predicted: Predicted, static_gain: float, dead_time_s: float
 ) -> Plan[StepResult]:
-    """The set-point step under the new gains; it is not larger than a step under the old gains might have been.
+    """The set-point step under the new gains; it is not larger than a step under the previous gains might have been.
 
     predicted: what the model predicts for the new gains.
     static_gain: the static gain of the model, PV units per MV unit, nan where it is not known.
@@ -25,7 +25,7 @@ def verification(
     """
     step = min(
         allowed_step(facts, point, max(gains.b, 1.0) * gains.Kp, abs(static_gain)),
-        allowed_step(facts, point, facts.old_gains.Kp, math.nan),
+        allowed_step(facts, point, facts.previous_gains.Kp, math.nan),
     )
     commands = (SetGains(gains), SetMode(Mode.AUTOMATIC), SetSetpoint(point.sp))
     yield from settle(point.sp, 0.02 * step, facts.T95_s / 5, 3 * facts.T95_s, point.noise, commands)

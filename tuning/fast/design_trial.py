@@ -72,7 +72,7 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
         )
     best, comparison = yield from worked(partial(_considered, model, options, facts))
     gains = best.gains
-    promised = predicted(comparison.after)
+    promised = predicted(comparison.new)
     yield (StageDone("design", gains),)
     shown: StepResult | None = None
     if options.verify and (comparison.gain or options.propose_anyway):
@@ -85,14 +85,14 @@ def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal
         method=FAST,
         chosen=chosen_for(options.spec(), best),
         model=IdentifiedModel("typed in", given.num, given.den, given.L),
-        old_gains=facts.old_gains,
+        previous_gains=facts.previous_gains,
         gains=gains,
         predicted=promised,
-        predicted_before=predicted(comparison.before) if comparison.before.stable else None,
+        predicted_previous=predicted(comparison.previous) if comparison.previous.stable else None,
         comparison=comparison,
         ultimate=ultimate(model),
         found=None,
-        known_before=None,
+        known_previous=None,
         verified=None,
         verification=shown,
         notes=(),

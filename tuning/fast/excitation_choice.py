@@ -119,7 +119,7 @@ def _near_rest(test: PulseTest, facts: Facts) -> Plan[bool]:
     if away() <= maximum:
         return True
     yield from test.report(
-        Note(f"MV is {away():.4g} from rest: the set-point goes home first, so that the relay does not jump too far")
+        Note(f"MV is {away():.4g} from rest: the set-point returns first, so that the relay does not jump too far")
     )
     yield from test.turn(0.0)
     home_s = facts.ramp_s(test.trace.sp[-1] - test.point.sp)

@@ -118,10 +118,12 @@ class Experiment:
         """
         facts, trace, samples = self.facts, self.trace, len(self.trace)
         if self._gains_tried is None or not self._steps:
-            return control_record(facts, trace, [(0, samples, facts.old_gains)])
+            return control_record(facts, trace, [(0, samples, facts.previous_gains)])
         moved = np.flatnonzero(np.diff(trace.sp[self._steps[0] - 1 :]))
         begun = self._steps[0] + int(moved[0]) if len(moved) else samples
-        return control_record(facts, trace, [(0, self.excited, facts.old_gains), (begun, samples, self._gains_tried)])
+        return control_record(
+            facts, trace, [(0, self.excited, facts.previous_gains), (begun, samples, self._gains_tried)]
+        )
 
     @property
     def _direction(self) -> float:

@@ -42,7 +42,7 @@ class ObservedPlant:
 
     def not_for(self, facts: Facts) -> str | None:
         """Why the loop as it is now is not the one that was observed, in words with the numbers; None where it is."""
-        now, then = facts.old_gains, self.gains
+        now, then = facts.previous_gains, self.gains
         if not _same_gains(now, then):
             return (
                 f"the gains in effect (Kp {now.Kp:.4g}, Ti {now.Ti:.4g} s) are not those under which the loop was "

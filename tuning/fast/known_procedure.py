@@ -194,7 +194,7 @@ def _tried(
         yield from test.step(tested, first.period)
         looked = yield from test.computed(partial(_look, facts, options, test.experiment_record(), first))
         if looked.refused is not None and looked.refused.reason in OPEN_REASONS:
-            yield from test.report(Note(f"after the set-point step: {looked.refused.detail}; it is stepped home"))
+            yield from test.report(Note(f"after the set-point step: {looked.refused.detail}; it is stepped back"))
             yield from test.step_home()
             looked = yield from test.computed(partial(_look, facts, options, test.experiment_record(), first))
         refused = looked.refused
@@ -205,7 +205,7 @@ def _tried(
     if refused is not None and refused.reason is Reason.CONTROLLER_MISMATCH:
         raise refused
     if refused is not None:
-        yield (SetGains(facts.old_gains), SetSetpoint(test.point.sp))
+        yield (SetGains(facts.previous_gains), SetSetpoint(test.point.sp))
         raise ObservedPlantFails(refused.reason, refused.detail, moved=True)
     assert looked is not None and looked.evaluation is not None
     return looked.evaluation, verified_step(looked.evaluation, tested, *test.stepped)

@@ -67,7 +67,7 @@ class ManualTest(PulseExperiment):
         self.largest = largest_pulse(self.home, facts.mv_low, facts.mv_high, facts.mv_step_max, only)
         if not self.largest > 0.0:
             raise Refused(Reason.SATURATED, f"MV {self.home:.4g} leaves no room for a pulse")
-        self.size = first_pulse(facts.old_gains.Kp * facts.sp_deviation, self.largest)
+        self.size = first_pulse(facts.previous_gains.Kp * facts.sp_deviation, self.largest)
         self._begun = len(self.trace)
         """The sample at which the first pulse, or its larger repetition, began."""
         self._farthest = 0.0

@@ -56,12 +56,13 @@ class FastOptions(DesignOptions):
     first wave.
     begins_with: the amplitude with which the default begins in place of its own, larger one, MV units: so that PV keeps
     its limits.
-    careful: the relay switches six times at least; without the set-point step it does so in any case.
+    min_switches: the smallest number of switches of the relay, one of SWITCHES; without the set-point step six at
+    least.
     """
 
     amplitude: float | None = None
     begins_with: float | None = None
-    careful: bool = False
+    min_switches: int = SWITCHES[0]
 
     def __post_init__(self) -> None:
         self.spec()
@@ -122,8 +123,8 @@ def _by_relay(facts: Facts, options: FastOptions, experiment: RelayTest) -> Plan
     yield from experiment.report(*started("relay"))
     evaluation: Evaluation | None = None
     outcome: Refused | Comparison = Refused(Reason.STALLED, "the relay came to nothing")
-    careful = options.careful or not options.verify
-    for switches in SWITCHES[careful:]:
+    smallest = options.min_switches if options.verify else max(options.min_switches, SWITCHES[1])
+    for switches in filter(lambda count: count >= smallest, SWITCHES):
         in_time = yield from experiment.relay(switches)
         evaluation = None
         try:

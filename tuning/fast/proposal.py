@@ -40,7 +40,7 @@ CRITERION = {
 }
 """J of each aim in words, as the comparison of old and new gains shows it."""
 
-NEVER_TRIED = "These gains were never tried on this loop, which stayed in manual. Watch it as it goes to automatic."
+NEVER_TRIED = "These gains were never tested on this loop, which stayed in manual. Watch it as it goes to automatic."
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,15 +182,16 @@ class FastProposal:
     method: the name of the procedure.
     chosen: the design parameters in effect.
     model: the process model that the gains were designed on.
-    old_gains, gains: the present gains and the gains proposed.
+    previous_gains, gains: the present gains and the gains proposed.
     predicted: the main figures of the new gains on the model.
-    predicted_before: the same figures of the old gains, None where the old gains are not stable on the model.
+    predicted_previous: the same figures of the previous gains, None where the previous gains are not stable on the
+    model.
     comparison: old and new gains on the model, with half a sample of delay added for the sampling. Where the comparison
     shows no gain, the present gains are kept, nothing is verified and there is nothing to decide on, unless a proposal
     was asked for all the same.
     ultimate: the ultimate point of the model, None where the model has none.
     found: the evaluation of the record, None without a record.
-    known_before: Ms of the old gains with its uncertainty, None without a record.
+    known_previous: Ms of the previous gains with its uncertainty, None without a record.
     verified: the set-point step that followed the relay, None without one.
     verification: the set-point step from rest, None without one.
     notes: what the operator should know, one sentence each.
@@ -200,14 +201,14 @@ class FastProposal:
     method: str
     chosen: Mapping[str, float]
     model: IdentifiedModel
-    old_gains: Gains
+    previous_gains: Gains
     gains: Gains
     predicted: Predicted
-    predicted_before: Predicted | None
+    predicted_previous: Predicted | None
     comparison: Comparison
     ultimate: Ultimate | None
     found: EvaluationSummary | None
-    known_before: KnownMs | None
+    known_previous: KnownMs | None
     verified: VerifiedStep | None
     verification: StepResult | None
     notes: tuple[str, ...]
@@ -306,18 +307,20 @@ def verified_step(evaluation: Evaluation, tested: Gains, size: float, duration_s
 
 
 def comparison_of(evaluation: Evaluation, facts: Facts, spec: DesignSpec, anyway: bool) -> Comparison:
-    """The comparison of the old gains with the gains designed on the record. Raises Refused as `comparison_on`."""
+    """The comparison of the previous gains with the gains designed on the record. Raises Refused as `comparison_on`."""
     return comparison_on(delayed(evaluation.model, evaluation.design_delay), evaluation.best, facts, spec, anyway)
 
 
 def comparison_on(sampled: Model, best: OptimalGains, facts: Facts, spec: DesignSpec, anyway: bool) -> Comparison:
-    """The comparison of the old gains with the optimal gains on a model.
+    """The comparison of the previous gains with the optimal gains on a model.
 
     sampled: the model with the delay of the sampling.
     anyway: a proposal is wanted even without a gain, see `compare`.
     Raises Refused, NOT_ROBUST.
     """
-    before, after = (loop_performance(sampled, gains, facts.sample_time_s) for gains in (facts.old_gains, best.gains))
+    before, after = (
+        loop_performance(sampled, gains, facts.sample_time_s) for gains in (facts.previous_gains, best.gains)
+    )
     if not after.stable:
         raise Refused(Reason.NOT_ROBUST, "the gains designed are not stable on their own model")
     aim, minimum = spec.aim, best.minimum
@@ -390,14 +393,14 @@ def proposed(
         method=method,
         chosen=chosen_for(spec, evaluation.best),
         model=identified_model(evaluation.fit, evaluation.chosen.best),
-        old_gains=facts.old_gains,
+        previous_gains=facts.previous_gains,
         gains=gains,
-        predicted=predicted(comparison.after),
-        predicted_before=predicted(comparison.before) if comparison.before.stable else None,
+        predicted=predicted(comparison.new),
+        predicted_previous=predicted(comparison.previous) if comparison.previous.stable else None,
         comparison=comparison,
         ultimate=ultimate(evaluation.model),
         found=found,
-        known_before=known_Ms(evaluation, facts.old_gains),
+        known_previous=known_Ms(evaluation, facts.previous_gains),
         verified=verified,
         verification=None,
         notes=tuple(notes),

@@ -99,9 +99,9 @@ class PulseTest(PulseExperiment):
 
     def __init__(self, facts: Facts, point: OperatingPoint, listened: Trace) -> None:
         super().__init__(facts, point, listened)
-        self.size = pulse_size(facts.sp_deviation, point.room, facts.old_gains, facts.one_sided)
+        self.size = pulse_size(facts.sp_deviation, point.room, facts.previous_gains, facts.one_sided)
         self.levels: list[float] = []  # of the set-point, in sizes of a pulse
-        self._gains = facts.old_gains
+        self._gains = facts.previous_gains
         self._at_limit = 0
 
     def start(self) -> Plan[None]:
@@ -238,7 +238,7 @@ class PulseTest(PulseExperiment):
             low=facts.mv_low - mv,
             high=facts.mv_high - mv,
             action=self._direction,
-            gains=facts.old_gains,
+            gains=facts.previous_gains,
             sp_step_max=facts.sp_rate_max_per_s * facts.sample_time_s,
         )
 

@@ -160,7 +160,7 @@ class Proposal:
 
     method, chosen: the method, and the design parameters in effect.
     model: the model on which the gains were designed.
-    old_gains, gains: the present gains and the gains proposed.
+    previous_gains, gains: the present gains and the gains proposed.
     predicted: the main figures of the new gains on the model.
     comparison: old and new gains on the model. Where it shows no gain, the present gains are kept, nothing is verified
     and there is nothing to decide on, unless a proposal was asked for all the same.
@@ -172,7 +172,7 @@ class Proposal:
     method: str
     chosen: Mapping[str, float]
     model: EstimatedModel
-    old_gains: Gains
+    previous_gains: Gains
     gains: Gains
     predicted: Predicted
     comparison: Comparison
@@ -279,7 +279,7 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
         model = yield from stage("estimate", finished.estimate, estimated)
     designed = yield from stage("optimise", finished.optimise, lambda: _designed(options, model, ultimate))
     notes += designed.notes
-    compare = partial(comparison_of, designed, model.plant(), facts.old_gains, facts.sample_time_s)
+    compare = partial(comparison_of, designed, model.plant(), facts.previous_gains, facts.sample_time_s)
     comparison = yield from worked(partial(compare, options.method_options, options.propose_anyway))
 
     verified: StepResult | None = None
@@ -292,7 +292,7 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
         method=options.method,
         chosen=designed.chosen,
         model=model,
-        old_gains=facts.old_gains,
+        previous_gains=facts.previous_gains,
         gains=designed.gains,
         predicted=designed.predicted,
         comparison=comparison,
@@ -313,11 +313,11 @@ def _baseline(facts: Facts, point: OperatingPoint, trace: Trace) -> Plan[StepRes
 
     trace: is filled with the samples.
     """
-    step = allowed_step(facts, point, facts.old_gains.Kp, math.nan)
+    step = allowed_step(facts, point, facts.previous_gains.Kp, math.nan)
     result = yield from step_test(
         facts, point, step, band=0.05, max_s=5 * facts.T95_s, smooth_s=facts.T95_s / 12, into=trace
     )
-    if abs(result.static_gain) * facts.old_gains.Kp > MAX_GAIN:
+    if abs(result.static_gain) * facts.previous_gains.Kp > MAX_GAIN:
         raise Refused(
             Reason.NOT_SELF_REGULATING,
             f"PV went {step:.4g} up and MV came back to where it was: that is a gain of {result.static_gain:.3g}",

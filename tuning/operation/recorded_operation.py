@@ -62,12 +62,12 @@ class Observed:
     @property
     def gains(self) -> Gains | None:
         """The proposed gains; None where none are proposed."""
-        return self.comparison.after.gains if self.comparison is not None and self.comparison.gain else None
+        return self.comparison.new.gains if self.comparison is not None and self.comparison.gain else None
 
     @property
     def Ms(self) -> float | None:
         """Ms of the designed gains on the model; None where there are none."""
-        return None if self.comparison is None else self.comparison.after.Ms
+        return None if self.comparison is None else self.comparison.new.Ms
 
     @property
     def known_to(self) -> float | None:
@@ -81,7 +81,7 @@ class Observed:
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the gains in effect beside the designed ones, and the conclusion."""
-        shown = [("in effect", self.stretch.gains, None if self.comparison is None else self.comparison.before.Ms)]
+        shown = [("in effect", self.stretch.gains, None if self.comparison is None else self.comparison.previous.Ms)]
         if self.gains is not None:
             shown.append(("proposed", self.gains, self.Ms))
         rows = [

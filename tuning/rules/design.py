@@ -91,26 +91,26 @@ def design(
 def comparison_of(
     designed: Designed,
     plant: FOPDT | SOPDT,
-    old_gains: Gains,
+    previous_gains: Gains,
     sample_time_s: float,
     options: Mapping[str, object],
     anyway: bool,
 ) -> Comparison:
-    """The comparison of the old gains with those of the rule, on the model that the rule was given.
+    """The comparison of the previous gains with those of the rule, on the model that the rule was given.
 
     The robust PI is compared by the bounds of this module and by its own criterion. The other rules minimise nothing:
     their gains are an improvement where they are more robust than the old ones, or lower the IAE.
     sample_time_s: the sample time, s.
     anyway: see `tuning.analysis.comparison.compare`.
     """
-    before, after = loop_performance(plant, old_gains, sample_time_s), loop_performance(plant, designed.gains)
+    before, after = loop_performance(plant, previous_gains, sample_time_s), loop_performance(plant, designed.gains)
     assert after.Ms is not None  # `design` sees to that
     of_robust = designed.method == ROBUST
     asked = RobustnessBounds(MAX_Ms, GM=MIN_GM) if of_robust else RobustnessBounds(after.Ms, by=f"by {designed.method}")
-    if of_robust and isinstance(plant, FOPDT) and _plain_pi(old_gains):
+    if of_robust and isinstance(plant, FOPDT) and _plain_pi(previous_gains):
         scale_free = options.get("scale_free")
         of = Criterion(plant, designed.chosen["horizon_s"], None if scale_free is None else bool(scale_free))
-        now, then = (None if J >= UNSTABLE else J for J in (of(g.Kp, g.Ti) for g in (old_gains, designed.gains)))
+        now, then = (None if J >= UNSTABLE else J for J in (of(g.Kp, g.Ti) for g in (previous_gains, designed.gains)))
         return compare(before, after, asked, CRITERION_7, (now, then), anyway)
     return compare(before, after, asked, OVER_PRESENT, IAE_over_present(before, after), anyway)
 

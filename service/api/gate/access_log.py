@@ -105,7 +105,7 @@ class Access:
                 "path": scope["path"],
                 "status": status,
                 "ms": round(seconds * 1e3, 1),
-                "who": scope.get("principal"),
+                "key": scope.get("principal"),
                 "address": address,
                 "job": found.get("job_id"),
                 "loop": found.get("tag"),

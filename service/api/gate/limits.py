@@ -13,7 +13,7 @@ from dataclasses import dataclass
 class RequestLimits:
     """A client is a key, or an address without a key.
 
-    rate_per_s, burst: requests of one client; decisions (abort, accept, roll back, dismiss) are counted apart.
+    rate_per_s, burst: requests of one client; decisions (abort, accept, roll back, acknowledge) are counted apart.
     at_once, streams_at_once, computations_at_once: requests of that kind, waiting or being answered, of all clients;
     one client may have half of them (`service.api.gate.places` has the kinds without an option).
     body_bytes: length of one body.  bodies_bytes: all bodies that have begun to arrive; one client may have half.

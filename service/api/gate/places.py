@@ -18,14 +18,14 @@ from enum import StrEnum
 from loopwright.service.api.gate.limits import RequestLimits
 
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
-_ABORT = re.compile(r"/(?:jobs|retunes)/[^/]+/abort")
-_PREVIEW = re.compile(r"/loops/[^/]+/retune/preview|/retunes/preview")
+_ABORT = re.compile(r"/(?:jobs|batches)/[^/]+/abort")
+_PREVIEW = re.compile(r"/loops/[^/]+/retune/preview|/batches/preview")
 
 
 class RequestKind(StrEnum):
     """The kind of a request; the value is how a refusal names it."""
 
-    ABORT = "aborts and dismissals"
+    ABORT = "aborts and acknowledgements"
     DECISION = "acceptances and rollbacks"
     COMMAND = "commands"
     READ = "reads of the database"
@@ -40,7 +40,7 @@ class RequestKind(StrEnum):
 
 DECIDES = (RequestKind.ABORT, RequestKind.DECISION)
 _LAST_WORDS = {
-    "abort": RequestKind.ABORT, "dismiss": RequestKind.ABORT,
+    "abort": RequestKind.ABORT, "acknowledge": RequestKind.ABORT,
     "accept": RequestKind.DECISION, "rollback": RequestKind.DECISION,
 }  # fmt: skip
 _OF_FIGURES = ("record", "designs", "report")
@@ -53,7 +53,7 @@ def changes_nothing(path: str) -> bool:
 
 
 def stops_a_test(method: str, path: str) -> bool:
-    """Whether the request is the abort of a job or of a retune of many loops."""
+    """Whether the request is the abort of a job or of a batch."""
     return method == "POST" and _ABORT.fullmatch(path) is not None
 
 

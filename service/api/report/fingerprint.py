@@ -11,10 +11,10 @@ from loopwright.service.api.samples import csv_text
 from loopwright.service.store.sample_blocks import Block
 
 FIELDS = (
-    "after", "before", "chosen", "comparison", "created_at", "detail", "dry_run", "ended_at", "evidence", "host", "id",
-    "loop", "method", "model", "model_from", "new_gains", "notes", "old_gains", "plant_time_s", "predicted",
-    "predicted_before", "reason", "rehearsed_on", "request", "requested_by", "sample_time_s", "started_at", "ultimate",
-    "verification",
+    "by", "comparison", "created_at", "design", "detail", "dry_run", "ended_at", "evidence", "gateway", "id",
+    "loop", "method", "model", "model_from", "new_gains", "notes", "plant_time_s", "predicted",
+    "predicted_previous", "previous_gains", "reason", "rehearsed_on", "request", "sample_time_s", "started_at",
+    "step_after", "step_before", "ultimate", "verification",
 )  # fmt: skip
 """The fields of GET /jobs/{id} that do not change any more once the job is over."""
 

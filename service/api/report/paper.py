@@ -76,7 +76,7 @@ def paper(source: ReportSource) -> str:
     """Returns the report as HTML."""
     job, loop = source.job, source.loop
     pv_unit = "PV units" if loop is None else n.unit(loop.pv_unit)
-    old, new = job.old_gains, job.new_gains
+    old, new = job.previous_gains, job.new_gains
     before, after = _performance(source, False), _performance(source, True)
     size = _step_size(source)
     Ms = after.Ms if after is not None else before.Ms if before is not None else None
@@ -151,8 +151,8 @@ def _verdict(job: JobView) -> str | None:
     acceptance."""
     if (compared := job.comparison) is None:
         return None
-    if job.state in (JobState.ACCEPTED, JobState.ROLLED_BACK) and compared.after.stable:
-        return beside(compared.before, compared.after)
+    if job.state in (JobState.ACCEPTED, JobState.ROLLED_BACK) and compared.new.stable:
+        return beside(compared.previous, compared.new)
     return compared.verdict
 
 
@@ -163,11 +163,11 @@ def _gains(view: GainsView | None) -> Gains | None:
 def _curves(source: ReportSource) -> tuple[LoopCurves | None, LoopCurves | None]:
     """What the gains before and after do: as computed with the designs, else on the job's model."""
     if (designs := source.designs) is not None:
-        return designs.before_curves, designs.after_curves
+        return designs.previous_curves, designs.new_curves
     job, Ts = source.job, source.job.sample_time_s or 0.0
     if job.model is None:
         return None, None
-    model, old, new = delayed(job.model.process_model(), 0.5 * Ts), _gains(job.old_gains), _gains(job.new_gains)
+    model, old, new = delayed(job.model.process_model(), 0.5 * Ts), _gains(job.previous_gains), _gains(job.new_gains)
     ends = horizons(model, (new, old), Ts)
     found = [None if gains is None else loop_curves(model, gains, ends, Ts) for gains in (old, new)]
     return found[0], found[1]
@@ -175,15 +175,15 @@ def _curves(source: ReportSource) -> tuple[LoopCurves | None, LoopCurves | None]
 
 def _performance(source: ReportSource, after: bool) -> PerformanceView | None:
     if (compared := source.job.comparison) is not None:
-        return compared.after if after else compared.before
+        return compared.new if after else compared.previous
     if source.designs is None:
         return None
-    return source.designs.after if after else source.designs.before
+    return source.designs.new if after else source.designs.previous
 
 
 def _step_size(source: ReportSource) -> float:
     job = source.job
-    for measured in (job.verification, job.after, job.before):
+    for measured in (job.verification, job.step_after, job.step_before):
         if measured is not None and measured.step:
             return abs(measured.step)
     return 1.0 if source.loop is None else source.loop.sp_deviation
@@ -202,8 +202,8 @@ def _head(source: ReportSource) -> list[Row]:
         rows += [("area", loop.area, False)] if loop.area else []
         rows += [("controller", where, False)]
     rows += [
-        ("job", job.id, False), ("gateway", job.host, False),
-        ("asked by", job.requested_by, False), ("method", job.method, False),
+        ("job", job.id, False), ("gateway", job.gateway, False),
+        ("asked by", job.by, False), ("method", job.method, False),
         ("asked for", f"{n.date(job.created_at)} UTC", False), ("begun", f"{n.date(job.started_at)} UTC", False),
         ("ended", f"{n.date(job.ended_at)} UTC", False), ("plant time", n.duration(job.plant_time_s), False),
     ]  # fmt: skip
@@ -215,14 +215,14 @@ def _decided(job: JobView, events: Sequence[JobEvent]) -> str:
         if job.decided.what == "accept":
             what = "The new gains were accepted"
         elif any(event.kind == "state" and event.data.get("state") == JobState.ACCEPTED for event in events):
-            what = "The new gains were accepted first, and the old ones put back"
+            what = "The new gains were accepted first, and the previous ones put back"
         else:
-            what = "The old gains were kept"
+            what = "The previous gains were kept"
         return f"{what} by {job.decided.by}, {n.date(job.decided.at)} UTC."
     if job.superseded_by is not None:
         return f"Nothing was decided before the later test, {job.superseded_by}."
     if job.state is JobState.PROPOSED:
-        return "Nothing is decided: the loop runs on its old gains."
+        return "Nothing is decided: the loop runs on its previous gains."
     return ""
 
 
@@ -232,7 +232,7 @@ def _afterwards(job: JobView, decimals: int, pv_unit: str) -> str:
         return ""
     restored = job.restored
     if restored is None:
-        return "The loop could not be read back at the end: look at the controller." if job.old_gains else ""
+        return "The loop could not be read back at the end: look at the controller." if job.previous_gains else ""
     text = f"At the end the loop was read back: {restored.get('mode')}"
     if isinstance(sp := restored.get("sp"), int | float):
         text += f", set-point {n.with_unit(n.fixed(sp, decimals), pv_unit)}"
@@ -286,7 +286,7 @@ def _table(
 
     within = None if job.evidence is None else job.evidence.uncertainty
     row("Ms", "", *figure("Ms"), 2, f" ± {n.Ms_error(within)}" if within is not None and new is not None else "")
-    row("Gain margin GM", "the plant's gain may grow by this factor", *figure("GM"), 2)
+    row("Gain margin GM", "", *figure("GM"), 2)
     row("Phase margin PM", "°", *figure("PM_deg"), 0)
     row("Overshoot of a set-point step", "%", *figure("overshoot_pct"), 0)
 
@@ -296,22 +296,22 @@ def _table(
 
     compared = job.comparison
     asked = _at_most(None if compared is None else compared.settling_s_asked)
-    row("Settling after a set-point step", f"s, into 5 %{asked}", *figure_step("settling_s", "setpoint"))
+    row("Settling time (5 %)", f"s{asked}", *figure_step("settling_s", "setpoint"))
     if compared is not None and compared.mv_peak_asked is not None:
         asked = _at_most(compared.mv_peak_asked)
-        row("Change of MV after it, at most", f"% per {pv_unit}{asked}", *figure_step("mv_peak", "setpoint"))
+        row("Largest output move", f"% per {pv_unit}{asked}", *figure_step("mv_peak", "setpoint"))
     row("IAE of a unit set-point step", "s", *figure_step("IAE", "setpoint"))
     row(f"IAE of a load step of {LOAD_PCT:g} %", f"{pv_unit} s", *figure_step("IAE", "load"))
     row("Largest deviation after it", pv_unit, *figure_step("peak", "load"))
-    if job.before is not None or job.after is not None:
-        measured = (job.before, job.after)
+    if job.step_before is not None or job.step_after is not None:
+        measured = (job.step_before, job.step_after)
 
         def both(name: str) -> tuple[float | None, float | None]:
             found = [None if each is None else getattr(each, name) for each in measured]
             return found[0], found[1]
 
         row("Overshoot, measured", "%", *both("overshoot_pct"), 0)
-        row("Settling, measured", "s", *both("settling_s"))
+        row("Settling time (5 %), measured", "s", *both("settling_s"))
         row("IAE, measured", f"{pv_unit} s", *both("IAE"))
     return rows
 
@@ -355,6 +355,17 @@ def _no_record(source: ReportSource) -> str:
     return "There is no record: the job ended before its second sample."
 
 
+_PARAMETERS = {
+    "K": "process gain K", "Kv": "velocity gain Kv", "T": "time constant T", "T1": "time constant T1",
+    "T2": "time constant T2", "zeta": "damping", "Tz": "zero, time constant Tz", "L": "dead time L",
+}  # fmt: skip
+"""Names of the parameters of a model; the page has the same."""
+
+
+def _with_its_unit(text: str, unit: str, pv_unit: str) -> str:
+    return n.with_unit(text, unit.replace("PV", n.unit(pv_unit)).replace("MV", "%")) if unit else text
+
+
 def _model_rows(source: ReportSource, pv_unit: str) -> list[Row]:
     job = source.job
     rows: list[Row] = []
@@ -362,12 +373,23 @@ def _model_rows(source: ReportSource, pv_unit: str) -> list[Row]:
     if isinstance(model, TransferModelView):
         rows += [
             ("structure", model.named, False),
-            ("dead time", n.with_unit(n.with_error(model.dead_time_s, model.dead_time_error_s), "s"), False),
-            ("numerator", f"{n.list_with_errors(model.num, model.num_errors)} ({pv_unit}/%)", True),
-            ("denominator", n.list_with_errors(model.den, model.den_errors), True),
+            *(
+                (
+                    _PARAMETERS[each.name],
+                    _with_its_unit(n.with_error(each.value, each.error), each.unit, pv_unit),
+                    False,
+                )
+                for each in model.parameters
+            ),
         ]
+        if not model.parameters:
+            rows += [
+                ("dead time L", n.with_unit(n.with_error(model.dead_time_s, model.dead_time_error_s), "s"), False),
+                ("numerator", f"{n.list_with_errors(model.num, model.num_errors)} ({pv_unit}/%)", True),
+                ("denominator", n.list_with_errors(model.den, model.den_errors), True),
+            ]
     elif model is not None:
-        rows.append(("gain K", f"{n.significant(model.K)} {pv_unit}/%", False))
+        rows.append(("process gain K", f"{n.significant(model.K)} {pv_unit}/%", False))
         rows.append(("time constant T", n.with_unit(n.significant(model.T_s), "s"), False))
         rows.append(("dead time L", n.with_unit(n.significant(model.L_s), "s"), False))
         rows += [("damping", n.significant(model.zeta), False)] if model.zeta is not None else []
@@ -381,7 +403,7 @@ def _model_rows(source: ReportSource, pv_unit: str) -> list[Row]:
         )
         rows.append(("Ms is known to", f"{unsure} that explain the record as well", True))
         left = "–" if found.residual is None else f"{n.fixed(found.residual, 2)} times the noise at rest"
-        rows.append(("not explained", left, False))
+        rows.append(("residual", left, False))
         rows.append(("excitation", f"{found.switches} switches or turns, {n.significant(found.period_s, 3)} s", False))
         if (seen := found.longest_delay_seen_s) is not None:
             text = f"would show up to {n.significant(seen, 3)} s later, with 30 % of the effect of MV; not a later one"
@@ -436,12 +458,12 @@ def _designs(curve: DesignCurve | None) -> list[list[str]]:
 def _asked(source: ReportSource) -> list[Row]:
     job, loop = source.job, source.loop
     rows: list[Row] = []
-    asked = {name: value for name, value in job.request.items() if name not in ("method", "requested_by", "by")}
+    asked = {name: value for name, value in job.request.items() if name not in ("method", "by")}
     given = ", ".join(f"{name} {_value(value)}" for name, value in asked.items() if value not in (None, False, {}, []))
     rows.append(("options", given or "none", True))
-    if job.chosen:
-        chosen = ", ".join(f"{name} {n.significant(value)}" for name, value in job.chosen.items())
-        rows.append(("design", chosen, True))
+    if job.design:
+        design = ", ".join(f"{name} {n.significant(value)}" for name, value in job.design.items())
+        rows.append(("design", design, True))
     if loop is not None:
         pv, mv = loop.pv_limits, loop.mv_limits
         low = _number(job.request.get("mv_low"), mv.low)

@@ -130,7 +130,7 @@ def step_pictures(
         for (curve, look), y in zip(curves, values, strict=True):
             picture.curve(curve.t, y, look)
         if unstable:
-            picture.labels.append(Label(60.0, 20.0, "before: not stable on the model"))
+            picture.labels.append(Label(60.0, 20.0, "previous: not stable on the model"))
         pictures.append(picture)
     return StepPictures(pictures[0], pictures[1], _nyquist(shown, Ms))
 

@@ -11,43 +11,44 @@ from loopwright.service.store.jobs import JobEvent
 from loopwright.tuning.reasons import Reason
 
 STAGES = {
-    "preflight": "At rest?",
+    "preflight": "Steady-state check",
     "settle": "Settling",
     "pulses": "Set-point pulses",
     "manual": "Manual-output pulses",
-    "relay": "Relay",
+    "relay": "Relay test",
     "design": "Model and gains",
-    "verify": "Step, new gains",
-    "redesign": "Whole record",
-    "baseline": "Step, old gains",
+    "verify": "Set-point step, new gains",
+    "redesign": "Final model",
+    "baseline": "Set-point step, previous gains",
     "ultimate": "Ultimate gain",
-    "zn_pi": "First PI",
-    "estimate": "Model",
-    "optimise": "Gains",
+    "zn_pi": "Ziegler-Nichols PI",
+    "estimate": "FOPDT estimate",
+    "optimise": "Optimisation",
 }
 _STRUCTURES = {"fopdt": "first order", "sopdt": "second order"}
-_REASONS = {
+REASONS = {
     Reason.OPERATOR: "by an operator",
     Reason.SERVICE_STOPPED: "the service ended",
-    Reason.SETPOINT_CHANGED: "the set-point was changed",
-    Reason.SETPOINT_IS_DRIVEN: "the set-point is driven by another controller",
+    Reason.SETPOINT_CHANGED: "set-point changed",
+    Reason.SETPOINT_IS_DRIVEN: "set-point is driven by another controller",
     Reason.PV_LIMIT: "PV left its limits",
     Reason.MV_LIMIT: "MV at its limit",
-    Reason.NODE_LOST: "the node was lost",
-    Reason.NODE_NOT_ANSWERING: "the node did not answer",
-    Reason.BUS_LOST: "the bus was lost",
+    Reason.NODE_LOST: "node lost",
+    Reason.NODE_NOT_ANSWERING: "node does not answer",
+    Reason.BUS_LOST: "bus lost",
+    Reason.GATEWAY_LOST: "gateway does not answer",
     Reason.INTERNAL: "an error inside the service",
 }
 _ENDS = {
-    JobState.QUEUED: "Waits for its turn",
+    JobState.QUEUED: "Queued",
     JobState.RUNNING: "Under test",
     JobState.PROPOSED: "New gains are proposed",
-    JobState.ACCEPTED: "The new gains were accepted",
-    JobState.ROLLED_BACK: "Rolled back to the old gains",
-    JobState.NO_GAIN: "The loop is tuned as well as asked already",
-    JobState.REHEARSED: "Rehearsed: gains were found without a test of the loop",
-    JobState.REFUSED: "No result to trust",
-    JobState.ABORTED: "Stopped",
+    JobState.ACCEPTED: "Accepted",
+    JobState.ROLLED_BACK: "Rolled back to the previous gains",
+    JobState.NO_GAIN: "No improvement: the loop is tuned as well as asked",
+    JobState.REHEARSED: "Rehearsed: gains found without a test of the loop",
+    JobState.REFUSED: "Refused",
+    JobState.ABORTED: "Aborted",
     JobState.FAILED: "Failed",
     JobState.INTERRUPTED: "Interrupted",
 }
@@ -62,7 +63,7 @@ def mark_names(stages: Sequence[str]) -> list[str]:
     for stage in stages:
         name = stage_name(stage)
         if stage == "verify" and before is not None:
-            name = f"Step, from where {before} left PV"
+            name = f"Set-point step, from where {before} left PV"
         if stage != "design":
             before = {"relay": "the relay", "pulses": "the pulses"}.get(stage)
         names.append(name)
@@ -82,7 +83,7 @@ def structure_words(structure: str) -> str:
 
 def reason_words(reason: Reason) -> str:
     """Returns a reason in words."""
-    return _REASONS.get(reason, reason.value.replace("_", " "))
+    return REASONS.get(reason, reason.value.replace("_", " "))
 
 
 def headline(job: JobView) -> str:
@@ -113,13 +114,13 @@ def trust(job: JobView) -> list[str]:
         Ms = job.predicted.Ms if job.predicted else job.evidence.Ms
         within = job.evidence.uncertainty
         said.append(f"Ms is {fixed(Ms, 2)}" + (f", known to within {Ms_error(within)}." if within is not None else "."))
-    if job.tried is False:
-        said.append("The new gains were never tried on this loop.")
+    if job.tested_on_loop is False:
+        said.append("The new gains were never tested on this loop.")
     if job.rehearsed_on is not None:
         said.append(f"Computed on {job.rehearsed_on.plant_text}; the loop was not moved.")
-    if job.after is not None and job.verification is None:
-        settled = f"settled in {duration(job.after.settling_s)}" if job.after.settled else "not settled"
-        overshoot = fixed(job.after.overshoot_pct, 0)
+    if job.step_after is not None and job.verification is None:
+        settled = f"settled in {duration(job.step_after.settling_s)}" if job.step_after.settled else "not settled"
+        overshoot = fixed(job.step_after.overshoot_pct, 0)
         said.append(f"A step under the new gains was measured: overshoot {overshoot} %, {settled}.")
     return said
 
@@ -180,18 +181,18 @@ def event_words(event: JobEvent) -> tuple[str, str] | None:
             "queued": "asked for",
             "running": "begun",
             "accepted": "new gains accepted, written to the controller",
-            "rolled_back": "old gains kept or written back",
+            "rolled_back": "previous gains kept or written back",
             "proposed": "ended with a proposal",
         }.get(state, f"ended: {state.replace('_', ' ')}")
         reason = data.get("reason")
         return (f"{what} ({str(reason).replace('_', ' ')})" if reason else what), by
     words = {
-        "abort_requested": "stop asked for",
+        "abort_requested": "abort requested",
         "accept_failed": f"an acceptance ended in an error: {text}",
         "rollback_failed": f"a rollback ended in an error: {text}",
         "resumed": f"resumed after a restart of the service: {text}",
         "loop_found": f"the loop was looked at again: {text}",
-        "dismissed": "responsibility for the loop taken over",
+        "acknowledged": "responsibility for the loop taken over",
         "samples_deleted": f"samples deleted: {text}",
     }
     return (words[event.kind], by) if event.kind in words else None

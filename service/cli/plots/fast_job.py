@@ -65,13 +65,13 @@ def before_after(figure: Figure | SubFigure, job: Shown, pv_unit: str) -> None:
 
     figure: a figure or a part of one.
     """
-    assert job.model is not None and job.old_gains is not None and job.new_gains is not None
+    assert job.model is not None and job.previous_gains is not None and job.new_gains is not None
     # with half a sample of delay, as the figures of the job
     model = delayed(job.model.process_model(), 0.5 * (job.sample_time_s or 0.0))
     turned = sign(model)  # the responses are of a plant of positive gain
     # method setpoint steps home, which is mostly down
     size = 1.0 if job.verification is None else abs(job.verification.step or 1.0)
-    gains = {label: shown.gains() for label, shown in (("before", job.old_gains), ("after", job.new_gains))}
+    gains = {label: shown.gains() for label, shown in (("previous", job.previous_gains), ("new", job.new_gains))}
     assessed = {label: assess(model, each) for label, each in gains.items()}
     figure.suptitle(f"{job.loop}: {_changes(gains, assessed)}", fontsize=10.5)
     axes = figure.subplots(2, 2, sharex="col", height_ratios=(3, 1.4))
@@ -101,13 +101,13 @@ def before_after(figure: Figure | SubFigure, job: Shown, pv_unit: str) -> None:
 
 def _changes(gains: Mapping[str, Gains], assessed: Mapping[str, Assessment]) -> str:
     """The gains before and after, and how the figures changed, in numbers."""
-    old, new = gains["before"], gains["after"]
+    old, new = gains["previous"], gains["new"]
     parts = [f"Kp {old.Kp:.3g} → {new.Kp:.3g}, Ti {old.Ti:.3g} → {new.Ti:.3g} s"]
     if old.Td or new.Td:
         parts[0] += f", Td {old.Td:.3g} → {new.Td:.3g} s"
     if old.b != 1.0 or new.b != 1.0:
         parts[0] += f", b {old.b:.3g} → {new.b:.3g}"
-    before, after = assessed["before"], assessed["after"]
+    before, after = assessed["previous"], assessed["new"]
     if before.margins.Ms and after.margins.Ms and before.stable:
         parts.append(f"Ms {before.margins.Ms:.2f} → {after.margins.Ms:.2f}")
     figures: list[str] = []

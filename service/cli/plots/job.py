@@ -34,7 +34,7 @@ def job_picture(path: Path, samples: Samples, job: Shown, pv_unit: str) -> None:
 
         fast_job(path, job, record, pv_unit)
         return
-    named = {"before": "baseline", "after": "verify"}
+    named = {"previous": "baseline", "new": "verify"}
     stages = {label: samples(stage) for label, stage in named.items()}
     stages = {label: columns for label, columns in stages.items() if columns.t_s}
     if not stages:
@@ -45,7 +45,7 @@ def job_picture(path: Path, samples: Samples, job: Shown, pv_unit: str) -> None:
 def before_after(path: Path, title: str, pv_unit: str, stages: dict[str, ShownSamples]) -> None:
     """Plots set-point steps over each other.
 
-    stages: the samples of the stages with the label "before" or "after".
+    stages: the samples of the stages with the label "previous" or "new".
     """
     figure = style.new_figure(9, 6)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.6))

@@ -23,7 +23,7 @@ class Shown(Protocol):
     detail: str | None
     advice: str | None
     model: ModelView | TransferModelView | None
-    old_gains: GainsView | None
+    previous_gains: GainsView | None
     new_gains: GainsView | None
     evidence: EvidenceView | None
     verification: VerificationView | None

@@ -18,7 +18,7 @@ BEFORE, AFTER, MEASURED, SETPOINT, MV, LOAD, OTHER = (
     "#b3402a", "#1f4e9e", "#555555", "#111111", "#2f6b3a", "#c77700", "#c4c4c4",
 )  # fmt: skip
 LOOKS: dict[str, tuple[str, str | tuple[int, tuple[int, int]]]] = {
-    "before": (BEFORE, (0, (5, 2))), "after": (AFTER, "-")
+    "previous": (BEFORE, (0, (5, 2))), "new": (AFTER, "-")
 }  # fmt: skip
 """The colour and the line of what is compared: colours differ in lightness, and curves in their dashes."""
 CURVES: tuple[tuple[str, str | tuple[int, tuple[float, ...]]], ...] = (

@@ -29,8 +29,8 @@ class AnnouncedJob(BaseModel):
     reason: Reason | None = Field(description="Why there is no proposal; null: there is or was one")
     detail: str | None = Field(description="The numbers behind the reason")
     dry_run: bool
-    requested_by: str = Field(examples=["night shift"])
-    host: str = Field(description="Name of the gateway that has the loop", examples=["local"])
+    by: str = Field(examples=["night shift"])
+    gateway: str = Field(description="Name of the gateway that has the loop", examples=["local"])
 
 
 class JobMessage(BaseModel):
@@ -62,7 +62,7 @@ def message_of(job: Job, event: WebhookEvent, own_url: str | None) -> JobMessage
         timestamp=now(),
         data=AnnouncedJob(
             id=job.id, url=f"{base}/jobs/{job.id}", page=f"{base}/ui/loops/{job.loop}", loop=job.loop, state=job.state,
-            reason=job.reason, detail=job.detail, dry_run=job.dry_run, requested_by=job.requested_by, host=job.host,
+            reason=job.reason, detail=job.detail, dry_run=job.dry_run, by=job.by, gateway=job.host,
         ),
     )  # fmt: skip
 

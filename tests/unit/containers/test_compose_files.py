@@ -69,7 +69,7 @@ def test_the_second_gateway_is_the_first_but_for_its_names() -> None:
         *a["command"][:3], "--need=LOOPWRIGHT_DATABASE", "--set=tag=TIC-201", *a["command"][4:]
     ]  # fmt: skip
     assert a["environment"]["LOOPWRIGHT_DATABASE"] == b["environment"]["LOOPWRIGHT_DATABASE"]
-    for own in ("LOOPWRIGHT_HOST", "LOOPWRIGHT_NODE"):
+    for own in ("LOOPWRIGHT_GATEWAY", "LOOPWRIGHT_NODE"):
         assert a["environment"][own] != b["environment"][own]
     for one in (a, b, found["database"]):
         assert "database-socket:/run/postgresql" in one["volumes"]

@@ -77,7 +77,7 @@ class FakeController:
     def hold(self) -> None:
         """The order HOLD."""
         if not self.session:
-            raise Failed(Reason.DEVICE_WENT_BACK, "the controller ended the test by itself")
+            raise Failed(Reason.SESSION_ENDED_BY_DEVICE, "the controller ended the test by itself")
         self.home, self.held = replace(self.home, mode=Mode.MANUAL, manual_output=self.home.mv), True
         self.state = self.home
 
@@ -124,7 +124,7 @@ class FakeLoop:
     def step(self, commands: Sequence[Command]) -> Sample:
         self.read()
         if not self._controller.session:
-            raise Failed(Reason.DEVICE_WENT_BACK, "the controller ended the test by itself")
+            raise Failed(Reason.SESSION_ENDED_BY_DEVICE, "the controller ended the test by itself")
         for command in commands:
             if isinstance(command, SetSetpoint):
                 self._controller.state = replace(self._controller.state, sp=command.value)
@@ -195,11 +195,11 @@ RESULT = FiveStageResult(
     method="five-stage",
     ultimate=UltimateView(Ku=2.05, Pu_s=3.32),
     model=ModelView(K=2.0, T_s=3.0, L_s=1.0),
-    old_gains=GainsView.of(OLD),
+    previous_gains=GainsView.of(OLD),
     new_gains=GainsView.of(NEW),
     predicted=PredictedView.model_validate(asdict(Predicted(1.6, 3.0, 60.0, 4.0, 8.0, 2.0))),
-    before=StepView.model_validate(asdict(StepResult(2.0, 40.0, 9.0, 20.0, 2.0, 3.0, 0.0, True, 30.0))),
-    after=StepView.model_validate(asdict(StepResult(2.0, 5.0, 4.0, 9.0, 2.0, 2.0, 0.0, True, 30.0))),
+    step_before=StepView.model_validate(asdict(StepResult(2.0, 40.0, 9.0, 20.0, 2.0, 3.0, 0.0, True, 30.0))),
+    step_after=StepView.model_validate(asdict(StepResult(2.0, 5.0, 4.0, 9.0, 2.0, 2.0, 0.0, True, 30.0))),
     notes=["all quiet"],
 )
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 from loopwright.protocol import profile
+from loopwright.service.api.report import words as report_words
 from loopwright.tuning import plan
 from tests.unit.tools.test_documents import DOCUMENTS, FILES, ROOT, text
 
@@ -102,6 +103,15 @@ def test_each_class_name_names_one_thing() -> None:
             where[name].append(module)
     assert {name for name, defined in where.items() if len(defined) > 1} == SAME_THING_TWICE
     assert {mode.name: mode.value for mode in plan.Mode} == {mode.name: mode.value for mode in profile.Mode}
+
+
+def test_page_and_report_have_one_name_for_each_stage_and_reason() -> None:
+    page = (ROOT / "service/api/web/static/js/words.js").read_text(encoding="utf-8")
+    tables = dict(re.findall(r"^const (STAGES|REASONS) = \{\n(.*?)^\};", page, re.MULTILINE | re.DOTALL))
+    stages = dict(re.findall(r'^  (\w+): \["(.*?)",', tables["STAGES"], re.MULTILINE))
+    reasons = dict(re.findall(r'^  (\w+): "(.*?)",', tables["REASONS"], re.MULTILINE))
+    assert stages == report_words.STAGES
+    assert reasons == {reason.value: said for reason, said in report_words.REASONS.items()}
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)

@@ -69,7 +69,7 @@ def test_a_loop_that_is_as_it_should_be() -> None:
     assert set(RULES) == set(AlarmKind)
 
 
-# level 1
+# priority 1
 
 
 def unconfirmed(**changes: object) -> UnconfirmedJob:
@@ -94,36 +94,38 @@ def test_a_false_pv_is_an_alarm_at_once_which_says_what_the_loop_was_left_in(
     found = FalsePvJob("4f0c2a9be113", "A", "gw-2", AT, reason, None if state is None else state_json(state))
     known = facts(false_pvs=(found,), tests=(job(JobState.FAILED, reason),))
     ((alarm,), (later,)) = steps(known, 0.0, 1e6)
-    assert (alarm.level, alarm.kind, alarm.loops, alarm.host) == (1, AlarmKind.FALSE_PV, ["A"], "gw-2")
+    assert (alarm.priority, alarm.kind, alarm.loops, alarm.gateway) == (1, AlarmKind.FALSE_PV, ["A"], "gw-2")
     assert alarm.text == f"PV was found to be false in a test; the loop {words}"
     assert alarm.advice.startswith(first) and "when PV is right again" in alarm.advice
-    assert "No test begins until somebody signs this off" in alarm.advice and alarm.to_sign
+    assert "No test begins until somebody acknowledges this" in alarm.advice and alarm.unacknowledged
     assert later == alarm, "it is the only alarm of that test"
-    assert not conditions(replace(known, false_pvs=(), signed=frozenset({alarm.id}))), "nor is there one afterwards"
+    assert not conditions(replace(known, false_pvs=(), acknowledged=frozenset({alarm.id}))), (
+        "nor is there one afterwards"
+    )
 
 
-def test_a_loop_that_was_not_confirmed_to_be_as_before_is_an_alarm_at_once_and_until_it_is_signed_off() -> None:
+def test_a_loop_that_was_not_confirmed_to_be_as_before_is_an_alarm_at_once_and_until_it_is_acknowledged() -> None:
     known = facts(unconfirmed=(unconfirmed(),), tests=(job(JobState.FAILED, Reason.RESTORE_UNCONFIRMED),))
     ((alarm,), (later,)) = steps(known, 0.0, 1e6)
-    assert (alarm.level, alarm.kind, alarm.subject, alarm.loops) == (1, AlarmKind.NOT_RESTORED, "A", ["A"])
+    assert (alarm.priority, alarm.kind, alarm.subject, alarm.loops) == (1, AlarmKind.NOT_RESTORED, "A", ["A"])
     assert alarm.text == "Not confirmed that the loop is as before the test"
-    assert "Look at the controller now" in alarm.advice and "until somebody signs it off" in alarm.advice
-    assert (alarm.since, alarm.host, alarm.job, alarm.to_sign) == (AT, "gw-2", "/jobs/4f0c2a9be113", True)
+    assert "Look at the controller now" in alarm.advice and "until somebody acknowledges it" in alarm.advice
+    assert (alarm.since, alarm.gateway, alarm.job, alarm.unacknowledged) == (AT, "gw-2", "/jobs/4f0c2a9be113", True)
     assert later == alarm, "it is the only alarm of that test"
     ids = {alarm_id(kind, "4f0c2a9be113") for kind in (NOT_RESTORED, FALSE_PV, "test_failed")}
     assert to_be_asked(facts(tests=known.tests)) == ids
-    signed = facts(tests=known.tests, signed=frozenset({alarm.id}))
-    assert not conditions(signed), "whoever has signed it off has seen how the test ended"
+    signed = facts(tests=known.tests, acknowledged=frozenset({alarm.id}))
+    assert not conditions(signed), "whoever has acknowledged it has seen how the test ended"
 
 
 def test_a_loop_that_was_read_back_later_says_so() -> None:
-    ((alarm,),) = steps(facts(unconfirmed=(unconfirmed(looked_after=False),)), 0.0)
-    assert alarm.advice.startswith("The loop was read back later") and "until somebody signs it off" in alarm.advice
+    ((alarm,),) = steps(facts(unconfirmed=(unconfirmed(monitored=False),)), 0.0)
+    assert alarm.advice.startswith("The loop was read back later") and "until somebody acknowledges it" in alarm.advice
     ((alarm,),) = steps(facts(unconfirmed=(unconfirmed(reason=Reason.NODE_LOST),)), 0.0)
-    assert alarm.level == 1 and "signs" not in alarm.advice
+    assert alarm.priority == 1 and "signs" not in alarm.advice
 
 
-# level 2
+# priority 2
 
 
 def test_a_bus_that_is_down_is_one_alarm_which_names_its_loops() -> None:
@@ -131,9 +133,9 @@ def test_a_bus_that_is_down_is_one_alarm_which_names_its_loops() -> None:
     known = facts(*loops, buses=(BusFacts(BUS, "no such interface", T0),))
     none, (alarm,), _ = steps(known, 0.0, 3.0, 60.0)
     assert not none
-    assert (alarm.level, alarm.kind, alarm.subject, alarm.loop) == (2, AlarmKind.BUS_DOWN, BUS, None)
+    assert (alarm.priority, alarm.kind, alarm.subject, alarm.loop) == (2, AlarmKind.BUS_DOWN, BUS, None)
     assert alarm.text == f"Bus {BUS} is down: no such interface" and alarm.loops == ["A", "B"]
-    assert (alarm.since, alarm.to_sign) == (AT, False)
+    assert (alarm.since, alarm.unacknowledged) == (AT, False)
 
 
 def test_an_error_that_names_the_bus_names_it_once() -> None:
@@ -145,7 +147,7 @@ def test_an_error_that_names_the_bus_names_it_once() -> None:
 def test_a_bus_that_only_the_listening_process_has_lost_says_so() -> None:
     known = facts(buses=(BusFacts(BUS, "the listening process has died", T0),))
     (found,) = conditions(known)
-    assert found.text == f"Bus {BUS} is not heard: the listening process has died" and "Tests go on" in found.advice
+    assert found.text == f"No data of bus {BUS}: the listening process has died" and "Tests go on" in found.advice
 
 
 def test_a_node_that_is_lost_is_one_alarm_which_names_its_loops() -> None:
@@ -153,7 +155,7 @@ def test_a_node_that_is_lost_is_one_alarm_which_names_its_loops() -> None:
     lost = HeardHeartbeat(T0, True, NmtState.OPERATIONAL)
     known = facts(*loops, nodes={(BUS, 32): lost, (BUS, 99): lost})
     none, (alarm,) = steps(known, 2.9, 3.0)
-    assert not none and (alarm.level, alarm.kind) == (2, AlarmKind.NODE_LOST)
+    assert not none and (alarm.priority, alarm.kind) == (2, AlarmKind.NODE_LOST)
     assert alarm.subject == f"node 20h on {BUS}" and alarm.loops == ["A", "B"] and alarm.since == AT
     assert alarm.text == "Node 20h (32) is lost: its heartbeat has stopped"
 
@@ -161,7 +163,7 @@ def test_a_node_that_is_lost_is_one_alarm_which_names_its_loops() -> None:
 def test_a_node_that_is_not_operational_says_its_state() -> None:
     known = facts(LoopFacts(config()), nodes={(BUS, 16): HeardHeartbeat(T0, False, NmtState.PRE_OPERATIONAL)})
     none, (alarm,) = steps(known, 0.0, 3.0)
-    assert not none and (alarm.level, alarm.text) == (2, "Node 10h (16) is pre-operational: it controls nothing")
+    assert not none and (alarm.priority, alarm.text) == (2, "Node 10h (16) is pre-operational: it controls nothing")
 
 
 @pytest.mark.parametrize("state", [NmtState.OPERATIONAL, NmtState.BOOT_UP, None])
@@ -183,7 +185,7 @@ def test_after_a_bus_is_back_its_nodes_have_time_to_speak() -> None:
 def test_a_loop_without_data_counts_from_its_last_sample() -> None:
     none, (alarm,) = steps(facts(LoopFacts(config(), heard(silent=True))), 2.9, 3.0)
     assert not none
-    assert (alarm.level, alarm.kind, alarm.subject, alarm.text) == (2, AlarmKind.NO_DATA, "A", "No data")
+    assert (alarm.priority, alarm.kind, alarm.subject, alarm.text) == (2, AlarmKind.NO_DATA, "A", "No data")
     assert alarm.since == AT
 
 
@@ -191,7 +193,7 @@ def test_a_loop_without_data_counts_from_its_last_sample() -> None:
 def test_a_loop_of_which_no_sample_ever_came(t95_s: float, after_s: float) -> None:
     known = facts(LoopFacts(config(t95_s=t95_s)), buses=(BusFacts(BUS, None, T0),))
     none, (alarm,) = steps(known, after_s - 0.1, after_s)
-    assert not none and alarm.text == "No data since the bus is heard"
+    assert not none and alarm.text == "No data since the bus is up"
 
 
 @pytest.mark.parametrize(
@@ -202,7 +204,7 @@ def test_a_loop_of_which_no_sample_ever_came(t95_s: float, after_s: float) -> No
 def test_pv_outside_its_limits(pv: float, text: str | None) -> None:
     none, alarms = steps(facts(LoopFacts(config(), heard(pv=pv))), 0.0, 3.0)
     assert not none and [alarm.text for alarm in alarms] == ([] if text is None else [text])
-    assert all((alarm.level, alarm.kind) == (2, AlarmKind.PV_OUTSIDE_LIMITS) for alarm in alarms)
+    assert all((alarm.priority, alarm.kind) == (2, AlarmKind.PV_OUTSIDE_LIMITS) for alarm in alarms)
 
 
 def test_a_pv_that_is_old_is_not_outside_its_limits() -> None:
@@ -222,7 +224,7 @@ def test_a_test_that_no_job_here_has_begun(changes: dict[str, object], text: str
     loop = LoopFacts(config(), heard(**changes))
     none, alarms = steps(facts(loop), 0.0, 5.0)
     assert not none and [alarm.text for alarm in alarms] == ([] if text is None else [text])
-    assert all((alarm.level, alarm.kind) == (2, AlarmKind.FOREIGN_TEST) for alarm in alarms)
+    assert all((alarm.priority, alarm.kind) == (2, AlarmKind.FOREIGN_TEST) for alarm in alarms)
     assert not steps(facts(loop), 0.0, 4.9)[1]
     assert not conditions(facts(replace(loop, job="4f0c2a9be113")))
 
@@ -234,7 +236,7 @@ def test_where_a_bus_is_not_listened_to_the_running_job_knows_pv() -> None:
     assert not conditions(facts(replace(loop, held=None), buses=()))
 
 
-# level 3
+# priority 3
 
 
 @pytest.mark.parametrize("state", JobState)
@@ -245,13 +247,17 @@ def test_only_a_test_that_failed_or_was_interrupted_is_abnormal(state: JobState)
 
 def test_the_last_test_failed() -> None:
     ((alarm,),) = steps(facts(tests=(job(JobState.FAILED, Reason.NODE_LOST),)), 0.0)
-    assert (alarm.level, alarm.text, alarm.advice) == (3, "The last test failed: node lost", ADVICE[Reason.NODE_LOST])
-    assert (alarm.since, alarm.job, alarm.to_sign) == (AT, "/jobs/4f0c2a9be113", True)
+    assert (alarm.priority, alarm.text, alarm.advice) == (
+        3,
+        "The last test failed: node lost",
+        ADVICE[Reason.NODE_LOST],
+    )
+    assert (alarm.since, alarm.job, alarm.unacknowledged) == (AT, "/jobs/4f0c2a9be113", True)
     ((alarm,),) = steps(facts(tests=(job(JobState.INTERRUPTED),)), 0.0)
     assert (alarm.text, alarm.advice) == ("The last test was interrupted", "See the job.")
     assert conditions(facts(tests=(job(JobState.FAILED, "full_moon"),)))[0].text == "The last test failed: full moon"
     assert not conditions(
-        facts(tests=(job(JobState.FAILED),), signed=frozenset({alarm_id("test_failed", "4f0c2a9be113")}))
+        facts(tests=(job(JobState.FAILED),), acknowledged=frozenset({alarm_id("test_failed", "4f0c2a9be113")}))
     )
 
 
@@ -259,7 +265,7 @@ def test_gains_that_differ_from_those_accepted() -> None:
     accepted = Acceptance("4f0c2a9be113", AT, "A. Lind", NEW, 1.6)
     loop = LoopFacts(config(), heard(), gains=(OLD, T0 + 1.0), accepted=accepted)
     ((alarm,),) = steps(facts(loop), 2.0)
-    assert (alarm.level, alarm.kind, alarm.job, alarm.to_sign) == (
+    assert (alarm.priority, alarm.kind, alarm.job, alarm.unacknowledged) == (
         3, AlarmKind.GAINS_DIFFER, "/jobs/4f0c2a9be113", True,
     )  # fmt: skip
     assert alarm.text == ("The gains differ from those accepted last: Kp 80, Ti 1.2 s instead of Kp 58.5, Ti 2.1 s")
@@ -268,9 +274,9 @@ def test_gains_that_differ_from_those_accepted() -> None:
     assert not conditions(facts(replace(loop, gains=None)))
     assert not conditions(facts(replace(loop, job="5e0c2a9be113")))
     signed = frozenset({alarm.id})
-    assert not conditions(facts(loop, signed=signed))
+    assert not conditions(facts(loop, acknowledged=signed))
     others = replace(loop, gains=(Gains(1.0, 1.0), T0 + 9.0))
-    assert conditions(facts(others, signed=signed)), "other gains than those that somebody has signed for"
+    assert conditions(facts(others, acknowledged=signed)), "other gains than those that somebody has signed for"
 
 
 # delays
@@ -323,7 +329,7 @@ def test_the_worst_comes_first() -> None:
         unconfirmed=(unconfirmed(loop="Z"),), tests=(job(JobState.FAILED, id_="2", loop="C"),),
     )  # fmt: skip
     found = steps(known, 0.0, 3.0)[1]
-    assert [(alarm.level, alarm.subject) for alarm in found] == [(1, "Z"), (2, "A"), (2, "B"), (3, "C")]
+    assert [(alarm.priority, alarm.subject) for alarm in found] == [(1, "Z"), (2, "A"), (2, "B"), (3, "C")]
 
 
 def test_times_are_utc() -> None:

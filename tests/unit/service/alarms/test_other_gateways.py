@@ -1,4 +1,4 @@
-"""Alarms of the gateways of one database: each once, signed off anywhere, and a gateway that has fallen silent."""
+"""Alarms of the gateways of one database: each once, acknowledged anywhere, and a gateway that has fallen silent."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ def test_a_silent_gateway_is_an_alarm_after_ten_seconds_and_until_three_after_it
     delays = Delays()
     assert alarms_at(delays, SILENT, T0 + 4.0, T0 + 9.9) == []
     (alarm,) = alarms_at(delays, SILENT, T0 + 10.0)
-    assert (alarm.level, alarm.kind, alarm.host, alarm.loop, alarm.loops) == (
+    assert (alarm.priority, alarm.kind, alarm.gateway, alarm.loop, alarm.loops) == (
         2,
-        "gateway_silent",
+        "gateway_offline",
         THERE,
         None,
         [TAG_THERE],
     )
     assert alarm.text == f"Gateway {THERE} does not answer" and alarm.since == "2026-01-31T12:00:00.000Z"
-    assert "is not known here" in alarm.advice and not alarm.to_sign
+    assert "is not known here" in alarm.advice and not alarm.unacknowledged
     back = replace(SILENT, silent=False, last_s=T0 + 20.0)
     assert alarms_at(delays, back, T0 + 20.0, T0 + 22.9) == [alarm] and alarms_at(delays, back, T0 + 23.0) == []
 
@@ -72,42 +72,42 @@ def test_a_gateway_that_never_was_there() -> None:
 
 def alarm(id_: str, kind: AlarmKind = AlarmKind.PV_OUTSIDE_LIMITS, host: str = THERE, **changes: Any) -> Alarm:
     given: dict[str, Any] = {
-        "id": id_, "level": 2, "kind": kind, "subject": TAG_THERE, "text": "text", "advice": "advice", "host": host,
-        "since": "2026-01-31T12:00:00.000Z", "loop": None, "loops": [], "job": None, "to_sign": False,
-        "signed_off": None,
+        "id": id_, "priority": 2, "kind": kind, "subject": TAG_THERE, "text": "text", "advice": "advice", "gateway":
+        host, "since": "2026-01-31T12:00:00.000Z", "loop": None, "loops": [], "job": None, "unacknowledged": False,
+        "acknowledged": None,
     }  # fmt: skip
     return Alarm(**given | changes)
 
 
-def facts_with(*theirs: Alarm, signed: Sequence[str] = ()) -> AlarmFacts:
+def facts_with(*theirs: Alarm, acknowledged: Sequence[str] = ()) -> AlarmFacts:
     there = GatewayFacts(THERE, T0, False, LONG_AGO_S, (TAG_THERE,), theirs)
-    return AlarmFacts(HERE, gateways=[there], signed=frozenset(signed))
+    return AlarmFacts(HERE, gateways=[there], acknowledged=frozenset(acknowledged))
 
 
 def test_each_alarm_is_once_and_the_worst_first() -> None:
     own, same = alarm("b", host=HERE), alarm("b", text="as the other says it")
-    worst = alarm("a", level=1)
+    worst = alarm("a", priority=1)
     assert merged([own], facts_with(same, worst)) == [worst, own]
 
 
 def test_what_a_silent_gateway_has_said_counts_until_that_is_an_alarm() -> None:
-    silent = alarm("s", AlarmKind.GATEWAY_SILENT)
+    silent = alarm("s", AlarmKind.GATEWAY_OFFLINE)
     assert merged([], facts_with(alarm("a"))) == [alarm("a")]
     assert merged([silent], facts_with(alarm("a"))) == [silent]
-    assert alarm("a") in merged([alarm("s", AlarmKind.GATEWAY_SILENT, host="gw-3")], facts_with(alarm("a")))
+    assert alarm("a") in merged([alarm("s", AlarmKind.GATEWAY_OFFLINE, host="gw-3")], facts_with(alarm("a")))
 
 
-def test_what_was_signed_off_is_gone_wherever_it_comes_from() -> None:
-    theirs = alarm("g", AlarmKind.GAINS_DIFFER, to_sign=True)
+def test_what_was_acknowledged_is_gone_wherever_it_comes_from() -> None:
+    theirs = alarm("g", AlarmKind.GAINS_DIFFER, unacknowledged=True)
     assert to_be_asked(facts_with(theirs, alarm("a"))) == {"g"}
-    assert merged([alarm("g", host=HERE)], facts_with(theirs, signed=["g"])) == []
+    assert merged([alarm("g", host=HERE)], facts_with(theirs, acknowledged=["g"])) == []
 
 
 def test_a_gateway_says_what_the_others_cannot_find_in_the_database() -> None:
     known = [alarm(str(kind), kind, HERE) for kind in AlarmKind]
     said = {each.kind for each in only_known_here([*known, alarm("b")], HERE)}
     assert set(AlarmKind) - said == {
-        AlarmKind.NOT_RESTORED, AlarmKind.FALSE_PV, AlarmKind.TEST_FAILED, AlarmKind.GATEWAY_SILENT,
+        AlarmKind.NOT_RESTORED, AlarmKind.FALSE_PV, AlarmKind.TEST_FAILED, AlarmKind.GATEWAY_OFFLINE,
         AlarmKind.SUSPECT_GAINS,
         AlarmKind.ROLLED_BACK, AlarmKind.MODEL_MISMATCH,
     }  # fmt: skip
@@ -139,11 +139,11 @@ def outside_its_limits(fleet: TwoGateways) -> Alarm:
 def test_an_alarm_of_the_other_gateway(fleet: TwoGateways) -> None:
     found = outside_its_limits(fleet)
     assert fleet.here.alarms_after(0.0) == [found], "with the time and the delay of its gateway"
-    assert (found.host, found.loop, found.text) == (THERE, TAG_THERE, "PV is above its limit of 100 degC")
+    assert (found.gateway, found.loop, found.text) == (THERE, TAG_THERE, "PV is above its limit of 100 degC")
     assert fleet.here.http.get("/alarms").json() == [found.model_dump(mode="json")]
     assert fleet.here.watch.counts() == {1: 0, 2: 0, 3: 0}, "its own gateway counts it"
     assert fleet.here.own.present(time.time()).alarms == [], "and says it"
-    answer = fleet.here.http.post(f"/alarms/{found.id}/sign-off", json={"by": "A. Lind"})
+    answer = fleet.here.http.post(f"/alarms/{found.id}/acknowledge", json={"by": "A. Lind"})
     assert answer.status_code == 409 and "it goes by itself 3 s after its cause has gone" in answer.json()["detail"]
     hears(fleet, 50.0)
     fleet.there.alarms_after(1.0)
@@ -152,15 +152,17 @@ def test_an_alarm_of_the_other_gateway(fleet: TwoGateways) -> None:
     assert fleet.here.alarms_after(0.0) == []
 
 
-def test_an_alarm_of_the_other_gateway_is_signed_off_here(fleet: TwoGateways, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_alarm_of_the_other_gateway_is_acknowledged_here(
+    fleet: TwoGateways, monkeypatch: pytest.MonkeyPatch
+) -> None:
     job = fleet.there.proposed()
     assert fleet.there.decide(job, "accept").status_code == 200
     monkeypatch.setattr(fleet.there.listening, "gains_read", lambda _tag: (OLD, time.time()))
     (differ,) = fleet.there.alarms_after(0.0)
     fleet.write()
     assert fleet.here.alarms_after(0.0) == [differ] and differ.kind is AlarmKind.GAINS_DIFFER
-    answer = fleet.here.http.post(f"/alarms/{differ.id}/sign-off", json={"by": "A. Lind"})
-    assert answer.status_code == 200 and answer.json()["signed_off"]["by"] == "A. Lind"
+    answer = fleet.here.http.post(f"/alarms/{differ.id}/acknowledge", json={"by": "A. Lind"})
+    assert answer.status_code == 200 and answer.json()["acknowledged"]["by"] == "A. Lind"
     assert fleet.here.alarms_after(0.0) == [], "although the row of its gateway has it still"
     assert fleet.there.alarms_after(0.0) == []
 
@@ -172,7 +174,7 @@ def test_a_gateway_that_does_not_answer(fleet: TwoGateways) -> None:
     assert fleet.here.alarms_after(60.0) == [found], "what it has said last"
     fleet.age(11.0)
     (silent,) = fleet.here.alarms_after(2.0)
-    assert (silent.kind, silent.subject, silent.loops) == (AlarmKind.GATEWAY_SILENT, f"gateway {THERE}", [TAG_THERE])
+    assert (silent.kind, silent.subject, silent.loops) == (AlarmKind.GATEWAY_OFFLINE, f"gateway {THERE}", [TAG_THERE])
     fleet.write()
     fleet.here.alarms_after(1.0)
     assert fleet.here.alarms_after(3.0) == [found]
@@ -191,7 +193,7 @@ def test_no_gateway_is_silent_because_the_database_was_away(
         assert fleet.here.alarms_after(60.0) == [found], "what the database has said last stays"
     fleet.age(61.0)  # the gateway there could not write either
     assert fleet.here.alarms_after(0.0) == fleet.here.alarms_after(1.0) == [found]
-    assert [each.kind for each in fleet.here.alarms_after(10.0)] == [AlarmKind.GATEWAY_SILENT]
+    assert [each.kind for each in fleet.here.alarms_after(10.0)] == [AlarmKind.GATEWAY_OFFLINE]
 
 
 def test_a_gateway_without_loops_is_not_missed(fleet: TwoGateways) -> None:

@@ -1,4 +1,4 @@
-"""Alarms of a service: over restarts, beside a database that is away, on two gateways of one database, signed off."""
+"""Alarms of a service: over restarts, beside a database that is away, on two gateways of one database, acknowledged."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from loopwright.service.jobs.aftercare import Aftercare
 from loopwright.service.listening.heard_loop import Heard, InEffect
 from loopwright.service.listening.listening import Listening
 from loopwright.service.states.job_state import JobState
-from loopwright.service.store import audit, looked_after
+from loopwright.service.store import audit, unconfirmed_restorations
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import LoopRow
@@ -85,7 +85,7 @@ class Watched:
 
     def after(self, seconds: float) -> list[tuple[int, str]]:
         self.clock.now_s += seconds
-        return [(alarm.level, alarm.text) for alarm in self.watch.look()]
+        return [(alarm.priority, alarm.text) for alarm in self.watch.look()]
 
 
 @pytest.fixture
@@ -118,7 +118,7 @@ def not_restored(controller: FakeController) -> None:
 
 def left(service: Service) -> Job:
     job = ended(service, becomes=not_restored)
-    assert (job.state, job.reason, job.look_after) == (JobState.FAILED, Reason.RESTORE_UNCONFIRMED, True)
+    assert (job.state, job.reason, job.restore_unconfirmed) == (JobState.FAILED, Reason.RESTORE_UNCONFIRMED, True)
     return job
 
 
@@ -187,10 +187,10 @@ def test_gains_that_somebody_has_changed_after_they_were_accepted(
     monkeypatch.setattr(watched.ear, "gains_read", lambda tag: (OLD, accepted_s - 60.0))
     assert watched.after(0.0) == []
     monkeypatch.setattr(watched.ear, "gains_read", lambda tag: (OLD, accepted_s + 1.0) if tag == TAG else None)
-    ((level, text),) = watched.after(1.0)
-    assert level == 3 and text.startswith("The gains differ from those accepted last: Kp 0.5,")
+    ((priority, text),) = watched.after(1.0)
+    assert priority == 3 and text.startswith("The gains differ from those accepted last: Kp 0.5,")
     (alarm,) = watched.watch.look()
-    watched.watch.sign_off(alarm.id, "B. Berg")
+    watched.watch.acknowledge(alarm.id, "B. Berg")
     assert watched.after(1.0) == []
     service.jobs.decisions.rollback(job.id, "A. Lind")
     assert watched.after(1.0) == [], "nothing is accepted any more"
@@ -214,7 +214,7 @@ def test_while_the_database_is_away_the_buses_are_watched(watched: Watched, monk
     monkeypatch.setattr("loopwright.service.alarms.facts.latest_tests", away)
     watched.ear.why = "no such interface"
     watched.after(1.0)
-    assert [level for level, _ in watched.after(3.0)] == [2, 3]
+    assert [priority for priority, _ in watched.after(3.0)] == [2, 3]
 
 
 def test_each_change_is_reported_once(watched: Watched) -> None:
@@ -240,40 +240,40 @@ def test_the_next_test_ends_the_alarm_of_the_last_one(watched: Watched) -> None:
     assert service.store.get(job.id).state == JobState.PROPOSED and watched.after(1.0) == []
 
 
-def test_a_loop_that_was_not_confirmed_stays_an_alarm_over_restarts_until_it_is_signed_off(tmp_path: Path) -> None:
+def test_a_loop_that_was_not_confirmed_stays_an_alarm_over_restarts_until_it_is_acknowledged(tmp_path: Path) -> None:
     with closing(Service(tmp_path)) as first:
         job = left(first)
         (alarm,) = Watched(first).watch.look()
-        assert (alarm.level, alarm.kind, alarm.loop) == (1, AlarmKind.NOT_RESTORED, TAG)
+        assert (alarm.priority, alarm.kind, alarm.loop) == (1, AlarmKind.NOT_RESTORED, TAG)
         assert alarm.job == f"/jobs/{job.id}" and "Look at the controller now" in alarm.advice
     with closing(Service(tmp_path)) as second:
-        assert looked_after.home_again(second.store, job.id, {}, "read back")
+        assert unconfirmed_restorations.confirmed(second.store, job.id, {}, "read back")
         ended(second)
         watched = Watched(second)
         (again,) = watched.watch.look()
         assert again.id == alarm.id and again.since == alarm.since, "although a later test has ended well"
         assert again.advice.startswith("The loop was read back later")
-        signed = watched.watch.sign_off(alarm.id, "A. Lind")
-        assert signed.signed_off is not None and signed.signed_off.by == "A. Lind"
+        signed = watched.watch.acknowledge(alarm.id, "A. Lind")
+        assert signed.acknowledged is not None and signed.acknowledged.by == "A. Lind"
         assert list(watched.watch.look()) == []
     with closing(Service(tmp_path)) as third:
         watched = Watched(third)
         assert list(watched.watch.look()) == []
         assert watched.watch.find(alarm.id) == signed
-        (entry,) = audit.trail(third.store.engine, 10, what=["alarm_sign_off"])
-        assert (entry.subject, entry.loop, entry.said_by) == (alarm.id, TAG, "A. Lind")
+        (entry,) = audit.trail(third.store.engine, 10, what=["acknowledge_alarm"])
+        assert (entry.subject, entry.loop, entry.by) == (alarm.id, TAG, "A. Lind")
         assert entry.before is not None and entry.before["text"] == alarm.text
 
 
-def test_whoever_answers_for_the_loop_has_signed_the_alarm_off(watched: Watched) -> None:
+def test_whoever_answers_for_the_loop_has_acknowledged_the_alarm(watched: Watched) -> None:
     job = left(watched.service)
     (alarm,) = watched.watch.look()
-    assert watched.service.jobs.aftercare.dismiss(TAG, "B. Berg") == [job.id]
+    assert watched.service.jobs.aftercare.acknowledge(TAG, "B. Berg") == [job.id]
     assert list(watched.watch.look()) == [], "neither of the loop nor of the test"
     found = watched.watch.find(alarm.id)
-    assert found.signed_off is not None and found.signed_off.by == "B. Berg"
-    with pytest.raises(Conflict, match=r"was signed off by B\. Berg"):
-        watched.watch.sign_off(alarm.id, "A. Lind")
+    assert found.acknowledged is not None and found.acknowledged.by == "B. Berg"
+    with pytest.raises(Conflict, match=r"was acknowledged by B\. Berg"):
+        watched.watch.acknowledge(alarm.id, "A. Lind")
 
 
 def test_a_loop_that_is_looked_after_for_another_reason_is_an_alarm_until_it_is_home(watched: Watched) -> None:
@@ -282,9 +282,9 @@ def test_a_loop_that_is_looked_after_for_another_reason_is_an_alarm_until_it_is_
 
     service = watched.service
     job = ended(service, becomes=gone)
-    assert (job.reason, job.look_after) == (Reason.NODE_LOST, True)
-    assert [level for level, _ in watched.after(0.0)] == [1]
-    assert looked_after.home_again(service.store, job.id, {}, "read back")
+    assert (job.reason, job.restore_unconfirmed) == (Reason.NODE_LOST, True)
+    assert [priority for priority, _ in watched.after(0.0)] == [1]
+    assert unconfirmed_restorations.confirmed(service.store, job.id, {}, "read back")
     assert watched.after(1.0) == [(3, "The last test failed: node lost")]
 
 
@@ -317,15 +317,15 @@ class Gateway:
 def test_two_gateways_of_one_database_say_the_same_and_do_not_double(two: tuple[Store, Store]) -> None:
     job = two[0].create("A", {}, "me", False)
     two[0].move(job.id, JobState.RUNNING)
-    two[0].move(job.id, JobState.FAILED, reason=Reason.RESTORE_UNCONFIRMED.value, look_after=True)
+    two[0].move(job.id, JobState.FAILED, reason=Reason.RESTORE_UNCONFIRMED.value, restore_unconfirmed=True)
     watches = [AlarmWatch(Gateway(store), Listening({}, store, on=False)) for store in two]
     one, other = (list(watch.look()) for watch in watches)
-    assert one == other and [(alarm.level, alarm.host) for alarm in one] == [(1, "gw-1")]
+    assert one == other and [(alarm.priority, alarm.gateway) for alarm in one] == [(1, "gw-1")]
     assert [watch.counts() for watch in watches] == [{1: 1, 2: 0, 3: 0}, {1: 0, 2: 0, 3: 0}]
-    watches[1].sign_off(one[0].id, "A. Lind")
+    watches[1].acknowledge(one[0].id, "A. Lind")
     assert ids(watches[0].look()) == ids(watches[1].look()) == []
-    with pytest.raises(Conflict, match=r"was signed off by A\. Lind"):
-        watches[0].sign_off(one[0].id, "B. Berg")
+    with pytest.raises(Conflict, match=r"was acknowledged by A\. Lind"):
+        watches[0].acknowledge(one[0].id, "B. Berg")
 
 
 def test_of_two_who_sign_at_the_same_time_one_is_told_of_the_other(
@@ -336,10 +336,10 @@ def test_of_two_who_sign_at_the_same_time_one_is_told_of_the_other(
     slow, fast = (AlarmWatch(Gateway(store), Listening({}, store, on=False)) for store in two)
     (alarm,) = slow.look()
     monkeypatch.setattr(slow, "look", lambda fresh_s=0.0: [alarm])
-    fast.sign_off(alarm.id, "A. Lind")
-    with pytest.raises(Conflict, match=r"was signed off by A\. Lind"):
-        slow.sign_off(alarm.id, "B. Berg")
-    assert len(audit.trail(two[0].engine, 10, what=["alarm_sign_off"])) == 1
+    fast.acknowledge(alarm.id, "A. Lind")
+    with pytest.raises(Conflict, match=r"was acknowledged by A\. Lind"):
+        slow.acknowledge(alarm.id, "B. Berg")
+    assert len(audit.trail(two[0].engine, 10, what=["acknowledge_alarm"])) == 1
 
 
 # REST and the command line
@@ -350,19 +350,19 @@ def test_over_rest(service: Service, client: TestClient) -> None:
     job = left(service)
     time_of = service.store.get(job.id).ended_at
     alarm = the_alarm(client)
-    assert (alarm["level"], alarm["kind"], alarm["subject"], alarm["loops"]) == (1, "not_restored", TAG, [TAG])
-    assert (alarm["since"], alarm["job"], alarm["signed_off"]) == (time_of, f"/jobs/{job.id}", None)
+    assert (alarm["priority"], alarm["kind"], alarm["subject"], alarm["loops"]) == (1, "not_restored", TAG, [TAG])
+    assert (alarm["since"], alarm["job"], alarm["acknowledged"]) == (time_of, f"/jobs/{job.id}", None)
     assert client.get(f"/alarms/{alarm['id']}").json() == alarm
-    answer = client.post(f"/alarms/{alarm['id']}/sign-off", json={"by": "A. Lind"})
-    assert answer.status_code == 200 and answer.json()["signed_off"]["by"] == "A. Lind"
+    answer = client.post(f"/alarms/{alarm['id']}/acknowledge", json={"by": "A. Lind"})
+    assert answer.status_code == 200 and answer.json()["acknowledged"]["by"] == "A. Lind"
     assert client.get("/alarms").json() == []
     assert client.get(f"/alarms/{alarm['id']}").json() == answer.json()
-    detail = assert_problem(client.post(f"/alarms/{alarm['id']}/sign-off", json={}), 409)["detail"]
-    assert "signed off by A. Lind at " in detail
-    for path in ("/alarms/none", "/alarms/none/sign-off"):
+    detail = assert_problem(client.post(f"/alarms/{alarm['id']}/acknowledge", json={}), 409)["detail"]
+    assert "acknowledged by A. Lind at " in detail
+    for path in ("/alarms/none", "/alarms/none/acknowledge"):
         method = "POST" if path.endswith("off") else "GET"
         assert "there is no alarm none" in assert_problem(client.request(method, path), 404)["detail"]
-    assert client.get("/audit?what=alarm_sign_off").json()[0]["said_by"] == "A. Lind"
+    assert client.get("/audit?what=acknowledge_alarm").json()[0]["by"] == "A. Lind"
 
 
 def the_alarm(client: TestClient) -> dict[str, Any]:
@@ -372,21 +372,22 @@ def the_alarm(client: TestClient) -> dict[str, Any]:
     return dict(alarm)
 
 
-def test_an_alarm_whose_cause_lasts_is_not_signed_off(service: Service) -> None:
+def test_an_alarm_whose_cause_lasts_is_not_acknowledged(service: Service) -> None:
     watched = Watched(service)
     watched.ear.why = "no such interface"
     watched.after(0.0)
     watched.after(3.0)
     (alarm,) = watched.watch.look()
     with TestClient(app_of(service.jobs, listening=watched.ear, alarms=watched.watch)) as client:
-        detail = assert_problem(client.post(f"/alarms/{alarm.id}/sign-off", json={"by": "me"}), 409)["detail"]
+        detail = assert_problem(client.post(f"/alarms/{alarm.id}/acknowledge", json={"by": "me"}), 409)["detail"]
         assert detail == (
-            "an alarm of level 2 is not signed off: it goes by itself 3 s after its cause has gone. "
+            "an alarm of priority 2 is not acknowledged: it goes by itself 3 s after its cause has gone. "
             f"{BUS}: Bus {BUS} is down: no such interface"
         )
         lines = client.get("/metrics").text.splitlines()
         assert [line for line in lines if line.startswith("loopwright_alarms")] == [
-            'loopwright_alarms{level="1"} 0.0', 'loopwright_alarms{level="2"} 1.0', 'loopwright_alarms{level="3"} 0.0',
+            'loopwright_alarms{priority="1"} 0.0', 'loopwright_alarms{priority="2"} 1.0',
+            'loopwright_alarms{priority="3"} 0.0',
         ]  # fmt: skip
     with pytest.raises(NoSuchAlarm):
         watched.watch.find("none")
@@ -401,11 +402,11 @@ def test_on_the_command_line(service: Service, client: TestClient, monkeypatch: 
         assert done.exit_code == 0, done.output
         return done.stdout
 
-    assert said() == "Nothing is abnormal.\n"
+    assert said() == "No active alarms.\n"
     left(service)
     alarm = the_alarm(client)
     shown = said()
     assert alarm["id"] in shown and TAG in shown and "Not confirmed" in " ".join(shown.split())
     assert f'"id": "{alarm["id"]}"' in said("--json")
-    assert said("--sign-off", alarm["id"], "--by", "A. Lind").startswith(f"{TAG}: signed off by A. Lind at ")
-    assert said() == "Nothing is abnormal.\n"
+    assert said("--acknowledge", alarm["id"], "--by", "A. Lind").startswith(f"{TAG}: acknowledged by A. Lind at ")
+    assert said() == "No active alarms.\n"

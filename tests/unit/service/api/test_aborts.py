@@ -37,15 +37,15 @@ def aborted(service: Service, job_id: str) -> AuditRow:
     assert (row.state, row.reason, row.stop_reason) == ("aborted", Reason.OPERATOR, Reason.OPERATOR)
     (event,) = [each for each in service.store.events(job_id) if each.kind == "abort_requested"]
     (entry,) = [each for each in audit.trail(service.store.engine, 100) if each.what == "abort"]
-    assert (entry.subject, entry.said_by) == (job_id, event.data["by"])
+    assert (entry.subject, entry.by) == (job_id, event.data["by"])
     return entry
 
 
 @pytest.mark.parametrize(
     ("method", "path", "stops"),
-    [("POST", "/jobs/4f0c2a9be113/abort", True), ("POST", "/retunes/4f0c2a9be113/abort", True),
+    [("POST", "/jobs/4f0c2a9be113/abort", True), ("POST", "/batches/4f0c2a9be113/abort", True),
      ("GET", "/jobs/4f0c2a9be113/abort", False), ("DELETE", "/jobs/4f0c2a9be113/abort", False),
-     ("POST", "/jobs/4f0c2a9be113/accept", False), ("POST", "/loops/TIC-101/dismiss", False),
+     ("POST", "/jobs/4f0c2a9be113/accept", False), ("POST", "/loops/TIC-101/acknowledge", False),
      ("POST", "/jobs/x/abort/abort", False), ("POST", "/loops/x/abort", False)],
 )  # fmt: skip
 def test_which_requests_stop_a_test(method: str, path: str, stops: bool) -> None:
@@ -73,7 +73,7 @@ def test_with_an_idempotency_key_it_does_not_wait_for_the_claim(
         finally:
             free.set()
     assert answer.result().status_code == 202
-    assert aborted(service, job_id).said_by == "operator A"
+    assert aborted(service, job_id).by == "operator A"
 
 
 def test_the_database_takes_nothing_from_the_claim_to_the_end(
@@ -85,14 +85,14 @@ def test_the_database_takes_nothing_from_the_claim_to_the_end(
         first = client.post(f"/jobs/{job_id}/abort", json={"by": "operator A"}, headers=KEY)
         again = client.post(f"/jobs/{job_id}/abort", json={"by": "operator A"}, headers=KEY)
         assert first.status_code == again.status_code == 202
-    assert aborted(service, job_id).said_by == "operator A"
+    assert aborted(service, job_id).by == "operator A"
 
 
 def test_another_request_that_the_database_does_not_take_is_refused_as_before(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(service.store, "writing", away)
-    for path in (f"/loops/{TAG}/retune", f"/loops/{TAG}/dismiss", "/jobs/4f0c2a9be113/accept"):
+    for path in (f"/loops/{TAG}/retune", f"/loops/{TAG}/acknowledge", "/jobs/4f0c2a9be113/accept"):
         assert_problem(client.post(path, json={}, headers=KEY), 503)
 
 
@@ -103,7 +103,7 @@ def without_a_turn(client: TestClient, path: str) -> int:
 
 
 def with_a_key_of_another_request(client: TestClient, path: str) -> int:
-    assert client.post("/loops/FIC-2/dismiss", json={}, headers=KEY).status_code == 200
+    assert client.post("/loops/FIC-2/acknowledge", json={}, headers=KEY).status_code == 200
     return client.post(path, json={"by": "me"}, headers=KEY).status_code
 
 
@@ -113,7 +113,7 @@ def test_a_refused_one_is_heard_and_written_down(
 ) -> None:
     job_id = service.under_test()
     assert ask(client, f"/jobs/{job_id}/abort") == status
-    assert aborted(service, job_id).who == "local"
+    assert aborted(service, job_id).key == "local"
 
 
 def test_a_job_that_ends_while_the_request_waits_was_aborted_by_it(
@@ -130,9 +130,9 @@ def test_a_job_that_ends_while_the_request_waits_was_aborted_by_it(
     monkeypatch.setattr(service.store, "request_stop", slow)
     answer = client.post(f"/jobs/{job_id}/abort", json={"by": "operator A"})
     assert (answer.status_code, answer.json()["state"]) == (202, "aborted")
-    assert aborted(service, job_id).said_by == "operator A"
+    assert aborted(service, job_id).by == "operator A"
     assert_problem(client.post(f"/jobs/{job_id}/abort", json={"by": "operator B"}), 409)
-    assert aborted(service, job_id).said_by == "operator A"
+    assert aborted(service, job_id).by == "operator A"
 
 
 class Door:
@@ -201,7 +201,7 @@ def test_an_abort_does_not_wait_long_for_keys_that_are_not_read(
             assert door.client.post(f"/jobs/{job_id}/abort", json={"by": "A"}).status_code == 202
         finally:
             over.set()
-    assert aborted(service, job_id).said_by == "A"
+    assert aborted(service, job_id).by == "A"
 
 
 Then = Callable[[Door, pytest.MonkeyPatch], None]

@@ -20,7 +20,7 @@ GOLDEN = Path(__file__).parents[3] / "golden" / "openapi.json"
 
 
 def start(client: TestClient, **options: Any) -> str:
-    answer = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"} | options)
+    answer = client.post(f"/loops/{TAG}/retune", json={"by": "me"} | options)
     assert answer.status_code == 202, answer.text
     assert answer.headers["location"] == f"/jobs/{answer.json()['id']}"
     return str(answer.json()["id"])
@@ -59,9 +59,9 @@ def test_live_state_of_a_busy_loop_comes_from_its_job(service: Service, client: 
 
 
 def test_a_retune_ends_as_a_proposal(service: Service, client: TestClient) -> None:
-    job = finished(service, client, requested_by="me")
-    assert job["state"] == "proposed" and job["progress"] == 1.0 and job["requested_by"] == "me"
-    assert job["old_gains"]["Kp"] == OLD.Kp and job["new_gains"]["Kp"] == NEW.Kp
+    job = finished(service, client, by="me")
+    assert job["state"] == "proposed" and job["progress"] == 1.0 and job["by"] == "me"
+    assert job["previous_gains"]["Kp"] == OLD.Kp and job["new_gains"]["Kp"] == NEW.Kp
     assert job["new_gains"]["form"] == "ISA"
     assert [s["stage"] for s in job["stages"]] == ["preflight", "relay"]
     assert job["stages"][0]["result"] == {"Ku": 2.05, "Pu_s": 3.32}
@@ -69,6 +69,14 @@ def test_a_retune_ends_as_a_proposal(service: Service, client: TestClient) -> No
     assert job["notes"] == ["nearly there", "all quiet"]
     assert service.controller.state.gains == OLD
     assert service.controller.open == 0
+
+
+def test_a_decision_with_a_name_that_is_not_known_is_refused(service: Service, client: TestClient) -> None:
+    job = finished(service, client)["id"]
+    refused = client.post(f"/jobs/{job}/accept", json={"roll_back_by_itself": False})
+    assert_problem(refused, 422)
+    assert "body.roll_back_by_itself: unknown name; did you mean auto_rollback?" in refused.json()["detail"]
+    assert service.store.get(job).state == "proposed"
 
 
 def test_accept_then_roll_back(service: Service, client: TestClient) -> None:
@@ -92,11 +100,11 @@ def test_busy_loop_answers_409_with_the_active_job(service: Service, client: Tes
     done = finished(service, client)
     service.tune.hold.clear()
     job_id = start(client)
-    answer = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"})
+    answer = client.post(f"/loops/{TAG}/retune", json={"by": "me"})
     body = assert_problem(answer, 409)
     assert body["job"] == f"/jobs/{job_id}" == answer.headers["location"]
     assert assert_problem(client.post(f"{done['url']}/accept"), 409)["job"] == f"/jobs/{job_id}"
-    assert client.post("/loops/FIC-2/retune", json={"requested_by": "me"}).status_code == 202
+    assert client.post("/loops/FIC-2/retune", json={"by": "me"}).status_code == 202
 
 
 def test_progress_and_abort(service: Service, client: TestClient) -> None:
@@ -157,7 +165,7 @@ def test_absent_node(service: Service, client: TestClient) -> None:
         ({"overshoot_window_pct": [8, 50]}, "bad_input", 'add "method": "five-stage"'),
         ({"baseline": True}, "bad_input", "baseline: of the five-stage"),
         ({"method": "fast", "method_options": {"Ms": 1.4}}, "bad_input", "method_options: of the five-stage"),
-        ({"method": "five-stage", "ms": 1.4, "careful": True}, "bad_input", 'ms, careful: of "method": "fast"'),
+        ({"method": "five-stage", "Ms": 1.4, "min_switches": 6}, "bad_input", 'Ms, min_switches: of "method": "fast"'),
         ({"method": "simc", "amplitude_pct": 5}, "bad_input", 'amplitude_pct: of "method": "fast", not of simc'),
         ({"method": "simc", "start": "design"}, "bad_input", 'start: of "method": "fast"'),
         ({"start": "design"}, "bad_input", "start=design needs model"),
@@ -168,24 +176,24 @@ def test_absent_node(service: Service, client: TestClient) -> None:
             "five-stage takes a model of the form K, T_s, L_s",
         ),
         ({"start": "design", "model": {"num": [1], "den": [1]}}, "bad_input", "den must have a pole"),
-        ({"ms": 1.1}, "bad_input", "ms"),
-        ({"ms": 2.1}, "bad_input", "ms"),
+        ({"Ms": 1.1}, "bad_input", "Ms"),
+        ({"Ms": 2.1}, "bad_input", "Ms"),
         ({"amplitude_pct": 70}, "bad_limits", "needs 105 % of MV between its limits, which are 100 % apart"),
         ({"sp_devation": 1}, "bad_input", "sp_devation"),
         ({"plant": {"num": [1], "den": [1, 1]}}, "bad_input", "dry run"),
     ],
 )
 def test_bad_requests(shared_client: TestClient, body: dict[str, Any], reason: str, words: str) -> None:
-    problem = assert_problem(shared_client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"} | body), 422)
+    problem = assert_problem(shared_client.post(f"/loops/{TAG}/retune", json={"by": "me"} | body), 422)
     assert problem["reason"] == reason and words in problem["detail"]
     assert shared_client.get("/jobs").json() == []
 
 
 def test_the_request_kept_has_the_options_of_its_method_alone(service: Service, client: TestClient) -> None:
     asked = finished(service, client, baseline=False)["request"]
-    assert asked["method"] == "fast" and asked["ms"] == 1.6 and "overshoot_window_pct" not in asked
+    assert asked["method"] == "fast" and asked["Ms"] == 1.6 and "overshoot_window_pct" not in asked
     asked = finished(service, client, method="simc", method_options={"tau_c_s": 2})["request"]
-    assert asked["method"] == "simc" and asked["method_options"] == {"tau_c_s": 2.0} and "ms" not in asked
+    assert asked["method"] == "simc" and asked["method_options"] == {"tau_c_s": 2.0} and "Ms" not in asked
 
 
 @pytest.mark.parametrize("body", ['{"sp_deviation": NaN}', '{"mv_low": Infinity}', "{", "[]"])
@@ -202,7 +210,7 @@ def test_not_found(shared_client: TestClient, path: str) -> None:
 def test_other_http_errors_are_problems(shared_client: TestClient) -> None:
     assert_problem(shared_client.delete("/loops"), 405)
     assert_problem(shared_client.get("/jobs?limit=0"), 422)
-    assert_problem(shared_client.post("/loops/NONE/retune", json={"requested_by": "me"}), 404)
+    assert_problem(shared_client.post("/loops/NONE/retune", json={"by": "me"}), 404)
 
 
 def test_samples_as_columns_and_as_csv(service: Service, client: TestClient) -> None:
@@ -264,7 +272,7 @@ def test_a_dry_run_touches_nothing_and_does_not_block(service: Service, client: 
 
 def test_stopping_takes_no_new_work(service: Service, client: TestClient) -> None:
     service.jobs.request_stop()
-    answer = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"})
+    answer = client.post(f"/loops/{TAG}/retune", json={"by": "me"})
     assert assert_problem(answer, 503)["reason"] == "service_stopped"
 
 

@@ -167,7 +167,7 @@ def test_a_refused_job_whose_stages_found_a_model(service: Service, client: Test
 
 
 @pytest.mark.parametrize("reason", DISPROVED)
-@pytest.mark.parametrize("query", ["", "?method=simc", "?ms=1.4"])
+@pytest.mark.parametrize("query", ["", "?method=simc", "?Ms=1.4"])
 def test_no_gains_on_a_model_that_the_job_has_disproved(
     service: Service, client: TestClient, reason: Reason, query: str
 ) -> None:
@@ -191,7 +191,7 @@ def test_a_refused_job_whose_model_was_typed_in(service: Service, client: TestCl
 def test_gains_of_fast_for_another_Ms(service: Service, client: TestClient, Ms: float, derivative: bool) -> None:
     """Of a job whose record is not kept: on its model."""
     job = finished(service, client)
-    query = f"ms={Ms}&derivative={str(derivative).lower()}"
+    query = f"Ms={Ms}&derivative={str(derivative).lower()}"
     found = client.get(f"{job['url']}/alternatives?{query}").json()
     (fast,) = found["methods"]
     assert (fast["method"], fast["outcome"], fast["uncertainty"]) == ("fast", "tuned", None)
@@ -204,11 +204,11 @@ def test_gains_of_fast_for_another_Ms(service: Service, client: TestClient, Ms: 
     assert more["gains"]["b"] >= fast["gains"]["b"] and (Ms > 1.4 or more["gains"]["b"] > 1.0)
     assert more["retune"]["setpoint_weight_max"] == 2.0 and "setpoint_weight_max" not in fast["retune"]
     asked = retune_request(**fast["retune"])
-    assert (asked.method, asked.start, asked.ms, asked.derivative) == ("fast", "design", Ms, derivative)
+    assert (asked.method, asked.start, asked.Ms, asked.derivative) == ("fast", "design", Ms, derivative)
     assert asked.model is not None
     plant = asked.model.plant()
     assert plant.num[-1] / plant.den[-1] == pytest.approx(2.0) and plant.L == 1.0
-    assert client.post(f"/loops/{job['loop']}/retune", json=fast["retune"] | {"requested_by": "me"}).status_code == 202
+    assert client.post(f"/loops/{job['loop']}/retune", json=fast["retune"] | {"by": "me"}).status_code == 202
 
 
 def test_the_aim_of_other_gains_is_that_of_the_job_unless_another_is_asked_for(
@@ -217,7 +217,7 @@ def test_the_aim_of_other_gains_is_that_of_the_job_unless_another_is_asked_for(
     job = finished(service, client, aim="load")
     answers = {}
     for query in ("", *(f"&aim={aim}" for aim in Aim)):
-        found = client.get(f"{job['url']}/alternatives?ms=1.6{query}").json()
+        found = client.get(f"{job['url']}/alternatives?Ms=1.6{query}").json()
         (answers[query],) = found["methods"]
         asked = retune_request(**answers[query]["retune"])
         assert asked.aim == (query.removeprefix("&aim=") or "load")
@@ -234,30 +234,30 @@ def test_other_gains_keep_the_movement_of_MV_that_the_job_asked_for_and_the_sett
     service: Service, client: TestClient
 ) -> None:
     job = finished(service, client, mv_peak=0.7, settling_s=60.0)
-    url = f"{job['url']}/alternatives?ms=1.6"
+    url = f"{job['url']}/alternatives?Ms=1.6"
 
     def found(query: str) -> dict[str, Any]:
         (method,) = client.get(url + query).json()["methods"]
         return dict(method)
 
     own, wide, slow = found(""), found("&mv_peak=9"), found("&settling_s=20")
-    assert own["retune"]["mv_peak"] == 0.7 and "settling_s" not in own["retune"] and own["chosen"]["Ms"] == 1.6
+    assert own["retune"]["mv_peak"] == 0.7 and "settling_s" not in own["retune"] and own["design"]["Ms"] == 1.6
     assert wide["setpoint"]["peak_u"] > 0.7 >= own["setpoint"]["peak_u"] * 0.9998
-    assert slow["retune"]["settling_s"] == 20.0 and 1.1 <= slow["chosen"]["Ms"] < 1.55
-    assert slow["margins"]["Ms"] == pytest.approx(slow["chosen"]["Ms"], abs=0.01)
+    assert slow["retune"]["settling_s"] == 20.0 and 1.1 <= slow["design"]["Ms"] < 1.55
+    assert slow["margins"]["Ms"] == pytest.approx(slow["design"]["Ms"], abs=0.01)
     never = found("&settling_s=0.5")
     assert (never["outcome"], never["reason"], never["retune"]) == ("refused", "not_possible", None)
     again = found(f"&settling_s={re.findall(r'at least ([0-9.]+) s', never['detail'])[0]}")
     assert again["outcome"] == "tuned"
-    assert client.post(f"/loops/{job['loop']}/retune", json=again["retune"] | {"requested_by": "me"}).status_code == 202
+    assert client.post(f"/loops/{job['loop']}/retune", json=again["retune"] | {"by": "me"}).status_code == 202
 
 
 @pytest.mark.parametrize(
     "query",
     [
-        "settling_s=5", "mv_peak=2", "noise_gain=2", "ms=1.4&settling_s=0", "ms=1.4&mv_peak=-1",
-        "ms=1.4&noise_gain=nan", "ms=1.1", "ms=2.5", "ms=nan", "ms=1.4&method=simc", "derivative=true",
-        "ms=1.4&derivative=x", "aim=load", "ms=1.4&aim=comfort",
+        "settling_s=5", "mv_peak=2", "noise_gain=2", "Ms=1.4&settling_s=0", "Ms=1.4&mv_peak=-1",
+        "Ms=1.4&noise_gain=nan", "Ms=1.1", "Ms=2.5", "Ms=nan", "Ms=1.4&method=simc", "derivative=true",
+        "Ms=1.4&derivative=x", "aim=load", "Ms=1.4&aim=comfort",
     ],
 )  # fmt: skip
 def test_bad_wishes_for_another_Ms(service: Service, client: TestClient, query: str) -> None:
@@ -270,21 +270,21 @@ def test_another_Ms_from_the_record_of_a_job(service: Service, client: TestClien
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
     plant = {"num": [1.0], "den": [8.0, 6.0, 1.0], "dead_time_s": 1.0, "noise_std": 0.02, "sample_time_s": 0.1}
     rows = [
-        jobs.start(TAG, retune_request(dry_run=True, plant=PlantModel(**plant), ms=ms, verify=False))
+        jobs.start(TAG, retune_request(dry_run=True, plant=PlantModel(**plant), Ms=ms, verify=False))
         for ms in (1.4, 1.6)
     ]
     for row in rows:
         service.wait(row.id)
     asked, other = (client.get(f"/jobs/{row.id}").json() for row in rows)
     assert asked["state"] == other["state"] == "rehearsed", (asked["detail"], other["detail"])
-    (found,) = client.get(f"{other['url']}/alternatives?ms=1.4").json()["methods"]
+    (found,) = client.get(f"{other['url']}/alternatives?Ms=1.4").json()["methods"]
     assert found["outcome"] == "tuned" and 0 < found["uncertainty"] < 0.1
     for gain in ("Kp", "Ti"):
         assert found["gains"][gain] == pytest.approx(asked["new_gains"][gain], rel=0.01)
         assert found["gains"][gain] != pytest.approx(other["new_gains"][gain], rel=0.01)
     true = TransferFunction((1.0,), (8.0, 6.0, 1.0), 1.05)
     assert margins(true, Gains(found["gains"]["Kp"], found["gains"]["Ti"])).Ms == pytest.approx(1.4, abs=0.05)
-    (same,) = client.get(f"{other['url']}/alternatives?ms=1.6").json()["methods"]
+    (same,) = client.get(f"{other['url']}/alternatives?Ms=1.6").json()["methods"]
     assert same["gains"]["Kp"] == pytest.approx(other["new_gains"]["Kp"], rel=0.01)
     jobs.stop()
 

@@ -25,8 +25,8 @@ from tests.unit.service.postgres import Server
 
 JSON = {"Content-Type": "application/json"}
 POSTS = [
-    f"/loops/{TAG}/retune", f"/loops/{TAG}/retune/preview", "/retunes", "/tunings", "/jobs/none/rollback",
-    f"/loops/{TAG}/dismiss",
+    f"/loops/{TAG}/retune", f"/loops/{TAG}/retune/preview", "/batches", "/tunings", "/jobs/none/rollback",
+    f"/loops/{TAG}/acknowledge",
 ]  # fmt: skip
 
 
@@ -67,9 +67,9 @@ def test_a_key_given_twice_starts_nothing(client: TestClient, service: Service) 
         b"\xff\xfe",
         '{"by": "x"}'.encode("utf-16"),
         b'{"a": {"b": 1, "b": 2}}',
-        b'{"ms": NaN}',
-        b'{"ms": 1e999}',
-        b'{"ms": ' + b"9" * 5000 + b"}",
+        b'{"Ms": NaN}',
+        b'{"Ms": 1e999}',
+        b'{"Ms": ' + b"9" * 5000 + b"}",
         rb'{"by": "\u0000"}',
         rb'{"by": "\ud800"}',
         b"{",
@@ -103,7 +103,7 @@ def ended(shared_service: Service) -> str:
 
 
 @pytest.mark.parametrize("number", ["9" * 400, str(2**63), str(2**63 - 1), "-1", "abc", "1.5", "1e3", "٣", ""])
-@pytest.mark.parametrize("what", ["event", "/jobs?limit=", "/jobs?cursor=", "/retunes?cursor=", "/audit?cursor="])
+@pytest.mark.parametrize("what", ["event", "/jobs?limit=", "/jobs?cursor=", "/batches?cursor=", "/audit?cursor="])
 def test_whole_numbers_out_of_all_bounds(shared_client: TestClient, ended: str, number: str, what: str) -> None:
     if what == "event":
         headers = {"Last-Event-ID": number.encode()}
@@ -121,7 +121,7 @@ def test_the_last_event_there_can_be(client: TestClient, service: Service) -> No
 
 @pytest.mark.parametrize(
     "path",
-    ["/loops/%00", "/jobs/a%00b", "/jobs?loop=%00", "/audit?loop=%00", "/decisions?by=%00", "/retunes/%00"],
+    ["/loops/%00", "/jobs/a%00b", "/jobs?loop=%00", "/audit?loop=%00", "/decisions?by=%00", "/batches/%00"],
 )
 def test_text_that_no_database_keeps(path: str, tmp_path: Path, postgres: Server) -> None:
     store = Store(tmp_path, postgres.database())
@@ -141,49 +141,49 @@ def test_text_that_no_database_keeps(path: str, tmp_path: Path, postgres: Server
 @pytest.mark.parametrize(
     ("path", "body", "where"),
     [
-        (POSTS[0], {"ms": "1.6"}, "body.ms"),
-        (POSTS[0], {"ms": True}, "body.ms"),
+        (POSTS[0], {"Ms": "1.6"}, "body.Ms"),
+        (POSTS[0], {"Ms": True}, "body.Ms"),
         (POSTS[0], {"derivative": "true"}, "body.derivative"),
         (POSTS[0], {"dry_run": 0}, "body.dry_run"),
         (POSTS[0], {"amplitude_pct": "10"}, "body.amplitude_pct"),
-        (POSTS[0], {"requested_by": 7}, "body.requested_by"),
+        (POSTS[0], {"by": 7}, "body.by"),
         (POSTS[0], {"method": "five-stage", "overshoot_window_pct": [10, "50"]}, "body.overshoot_window_pct.1"),
         (POSTS[0], {"dry_run": True, "plant": {"num": ["1"], "den": [1, 1]}}, "body.plant.num.0"),
         (POSTS[0], {"start": "design", "model": {"K": "1", "T_s": 3, "L_s": 1}}, "body.model.K"),
         (POSTS[1], {"sp_deviation": "2"}, "body.sp_deviation"),
-        ("/retunes", {"pattern": "*", "at_once_per_bus": "2"}, "body.at_once_per_bus"),
-        ("/retunes", {"pattern": "*", "stop_after_failures": True}, "body.stop_after_failures"),
+        ("/batches", {"pattern": "*", "at_once_per_bus": "2"}, "body.at_once_per_bus"),
+        ("/batches", {"pattern": "*", "stop_after_failures": True}, "body.stop_after_failures"),
         ("/tunings", {"model": {"K": 1, "T_s": "3", "L_s": 1}}, "body.model.T_s"),
         (f"/loops/{TAG}/lock", {"reason": 5}, "body.reason"),
-        ("/jobs/none/accept", {"roll_back_by_itself": "no"}, "body.roll_back_by_itself"),
+        ("/jobs/none/accept", {"auto_rollback": "no"}, "body.auto_rollback"),
     ],
 )
 def test_strict_types(shared_client: TestClient, path: str, body: dict[str, Any], where: str) -> None:
-    answer = refused(shared_client, path, json.dumps({"requested_by": "me"} | body if path in POSTS[:3] else body))
+    answer = refused(shared_client, path, json.dumps({"by": "me"} | body if path in POSTS[:3] else body))
     assert answer.status_code == 422 and where in [each["where"] for each in answer.json()["errors"]], answer.text
 
 
 def test_whole_numbers_may_be_written_as_floats_and_a_query_is_text(shared_client: TestClient) -> None:
     plant = {"num": [2], "den": [3, 1], "seed": 3.0}
-    assert shared_client.post(POSTS[1], json={"dry_run": True, "plant": plant, "ms": 2}).status_code == 200
+    assert shared_client.post(POSTS[1], json={"dry_run": True, "plant": plant, "Ms": 2}).status_code == 200
     assert shared_client.get("/jobs?limit=2").status_code == 200
 
 
 @pytest.mark.parametrize("content", [None, b"", b"null"])
 def test_no_test_begins_without_a_body(client: TestClient, service: Service, content: bytes | None) -> None:
     answer = client.post(POSTS[0], content=content, headers=JSON if content else {})
-    assert answer.status_code == 422 and '{"requested_by": "YOUR NAME"}' in answer.json()["detail"]
+    assert answer.status_code == 422 and '{"by": "YOUR NAME"}' in answer.json()["detail"]
     assert client.post(POSTS[1]).status_code == 200, "a preview needs none"
     assert not service.store.recent()
 
 
-@pytest.mark.parametrize("body", [{}, {"requested_by": " "}, {"requested_by": None, "ms": 1.4}])
+@pytest.mark.parametrize("body", [{}, {"by": " "}, {"by": None, "Ms": 1.4}])
 def test_a_test_is_signed_where_no_key_names_the_caller(
     client: TestClient, service: Service, body: dict[str, Any]
 ) -> None:
-    for path, more in ((POSTS[0], {}), ("/retunes", {"pattern": "*"})):
+    for path, more in ((POSTS[0], {}), ("/batches", {"pattern": "*"})):
         answer = client.post(path, json=body | more)
-        assert answer.status_code == 422 and answer.json()["errors"][0]["where"] == "body.requested_by"
+        assert answer.status_code == 422 and answer.json()["errors"][0]["where"] == "body.by"
     assert not service.store.recent()
     assert client.post(POSTS[0], json=body | {"dry_run": True}).status_code == 202
 
@@ -193,7 +193,7 @@ def test_the_key_names_who_does_not_say_it(service: Service) -> None:
     _, key = keyring.create("control room", Scope.OPERATE)
     client = TestClient(app_of(service.jobs, Policy(keyring)), headers={"Authorization": f"Bearer {key}"})
     job = client.post(POSTS[0], json={}).json()
-    assert job["requested_by"] == "control room"
+    assert job["by"] == "control room"
     assert client.post(POSTS[0]).status_code == 422, "a body it needs all the same"
 
 

@@ -50,7 +50,7 @@ def open_door(stack: ExitStack, service: Service, keyring: Keyring | None = None
 
 def running(service: Service, door: Served, **headers: str) -> str:
     service.tune.hold.clear()
-    status, more, _ = door.ask("POST", f"/loops/{TAG}/retune", '{"requested_by": "me"}', **headers)
+    status, more, _ = door.ask("POST", f"/loops/{TAG}/retune", '{"by": "me"}', **headers)
     assert status == 202
     assert service.tune.inside.wait(PATIENCE_S)
     return more["location"]
@@ -112,7 +112,7 @@ def test_bodies_that_do_not_come_take_no_place(service: Service, stack: ExitStac
     for path in ("/healthz", "/loops", f"/loops/{TAG}", job):
         assert door.ask("GET", path)[0] == 200, path
     assert door.ask("POST", f"{job}/abort", '{"by": "me"}')[0] == 202
-    assert door.ask("POST", "/loops/FIC-2/retune", '{"requested_by": "me"}')[0] == 202
+    assert door.ask("POST", "/loops/FIC-2/retune", '{"by": "me"}')[0] == 202
 
 
 def test_a_body_that_does_not_come_is_waited_for_so_long(service: Service, stack: ExitStack) -> None:
@@ -128,7 +128,7 @@ def test_bodies_take_no_more_memory_than_permitted(service: Service, stack: Exit
     long = UNFINISHED.replace("Content-Length: 99", "Content-Length: 900000") + 90_000 * " "
     answer = rest(stack.enter_context(closing(door.begun(long))))
     assert answer.startswith(b"HTTP/1.1 429 ") and b"bodies of 50000 bytes of this client" in answer
-    assert door.ask("POST", f"/loops/{TAG}/retune", '{"requested_by": "me"}')[0] == 202
+    assert door.ask("POST", f"/loops/{TAG}/retune", '{"by": "me"}')[0] == 202
 
 
 def test_an_abort_goes_before_the_rate_of_reading(service: Service, stack: ExitStack) -> None:
@@ -145,12 +145,12 @@ def test_an_abort_goes_before_the_rate_of_reading(service: Service, stack: ExitS
         ("GET", "/readyz", RequestKind.WATCH),
         ("GET", "/metrics", RequestKind.WATCH),
         ("POST", "/jobs/4f0c2a9be113/abort", RequestKind.ABORT),
-        ("POST", "/retunes/4f0c2a9be113/abort", RequestKind.ABORT),
-        ("POST", "/loops/TIC-101/dismiss", RequestKind.ABORT),
+        ("POST", "/batches/4f0c2a9be113/abort", RequestKind.ABORT),
+        ("POST", "/loops/TIC-101/acknowledge", RequestKind.ABORT),
         ("POST", "/jobs/4f0c2a9be113/accept", RequestKind.DECISION),
         ("POST", "/jobs/4f0c2a9be113/rollback", RequestKind.DECISION),
         ("POST", "/loops/TIC-101/retune", RequestKind.COMMAND),
-        ("POST", "/retunes", RequestKind.COMMAND),
+        ("POST", "/batches", RequestKind.COMMAND),
         ("GET", "/loops", RequestKind.READ),
         ("GET", "/loops/TIC-101", RequestKind.BUS),
         ("GET", "/loops/TIC-101/jobs", RequestKind.READ),
@@ -456,7 +456,7 @@ def test_who_asks_is_believed_of_trusted_proxies_only(
     app = app_of(service.jobs, Policy(local_only=True), {})
     door = stack.enter_context(served(app, trusted_proxies=tuple(map(ip_network, trusted))))
     forwarded = {"X_Forwarded_For": "198.51.100.1, 203.0.113.9", "X_Forwarded_Proto": "https"}
-    assert door.ask("POST", f"/loops/{TAG}/retune", '{"requested_by": "me"}', **forwarded)[0] == 202
+    assert door.ask("POST", f"/loops/{TAG}/retune", '{"by": "me"}', **forwarded)[0] == 202
     _, _, body = door.ask("GET", "/audit")
     assert f'"address":"{address}"'.encode() in body
 

@@ -18,7 +18,7 @@ from tests.unit.service.fakes import TAG, Service
         ("GET", "/nothing", 404, "not_found"),
         ("GET", "/loops/TIC-999", 404, "unknown_loop"),
         ("GET", "/jobs/nothing", 404, "unknown_job"),
-        ("GET", "/retunes/nothing", 404, "unknown_retune"),
+        ("GET", "/batches/nothing", 404, "unknown_batch"),
         ("GET", "/alarms/nothing", 404, "unknown_alarm"),
         ("DELETE", "/loops", 405, "method_not_allowed"),
         ("GET", "/jobs?limit=0", 422, "bad_input"),
@@ -41,13 +41,14 @@ def test_a_decision_in_the_wrong_state_names_the_state(service: Service, client:
 def test_a_busy_loop_is_named_with_its_job(service: Service, client: TestClient) -> None:
     service.tune.hold.clear()
     job_id = start(client)
-    body = assert_problem(client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}), 409)
+    body = assert_problem(client.post(f"/loops/{TAG}/retune", json={"by": "me"}), 409)
     assert (body["reason"], body["job"]) == ("loop_busy", f"/jobs/{job_id}")
 
 
 @pytest.mark.parametrize(
     ("path", "words"),
     [
+        ("/loops/TIC-101/observation?ms=1.6", "query.ms: there is no such query parameter; did you mean Ms?"),
         ("/jobs?stat=running", "query.stat: there is no such query parameter; did you mean state?; the parameters are"),
         ("/healthz?verbose=1", "query.verbose: there is no such query parameter; there are none"),
         (f"/loops/{TAG}?x=1", "query.x"),

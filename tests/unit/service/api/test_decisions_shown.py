@@ -27,7 +27,7 @@ def client(service: Service) -> Iterator[TestClient]:
 
 
 def proposed(service: Service, by: str, loop: str = TAG) -> str:
-    job = service.jobs.start(loop, FastRetune(requested_by=by)).id
+    job = service.jobs.start(loop, FastRetune(by=by)).id
     until(lambda: service.store.get(job).state == "proposed")
     until(lambda: service.jobs.running(job) is None)
     return job
@@ -52,9 +52,9 @@ def test_what_was_decided_about_a_test(service: Service, client: TestClient) -> 
     ]  # fmt: skip
     rolled_back, accepted, begun = entries
     assert {each["job"] for each in entries} == {f"/jobs/{job}"} and {each["loop"] for each in entries} == {TAG}
-    assert (accepted["gains_before"]["Kp"], accepted["gains_after"]["Kp"]) == (OLD.Kp, NEW.Kp)
-    assert (rolled_back["gains_before"]["Kp"], rolled_back["gains_after"]["Kp"]) == (NEW.Kp, OLD.Kp)
-    assert begun["gains_before"] is begun["gains_after"] is None
+    assert (accepted["previous_gains"]["Kp"], accepted["new_gains"]["Kp"]) == (OLD.Kp, NEW.Kp)
+    assert (rolled_back["previous_gains"]["Kp"], rolled_back["new_gains"]["Kp"]) == (NEW.Kp, OLD.Kp)
+    assert begun["previous_gains"] is begun["new_gains"] is None
     assert {each["error"] for each in entries} == {None}
 
 
@@ -72,7 +72,7 @@ def test_a_decision_that_failed_says_why(service: Service, client: TestClient, m
         assert client.post(f"/jobs/{job}/accept", json={"by": "B. Berg"}).status_code == 409
     failed = listed(client)[0]
     assert (failed["what"], failed["by"]) == ("accept_failed", "B. Berg")
-    assert "meanwhile" in failed["error"] and failed["gains_after"] is None
+    assert "meanwhile" in failed["error"] and failed["new_gains"] is None
 
 
 def test_they_are_found_by_loop_name_and_time(service: Service, client: TestClient) -> None:

@@ -80,7 +80,7 @@ class Door:
 
         def begun() -> bool:
             try:
-                answer = self.ask("POST", f"/loops/{TAG}/retune", json={"requested_by": "me"})
+                answer = self.ask("POST", f"/loops/{TAG}/retune", json={"by": "me"})
             except httpx.TransportError:
                 return False
             assert answer.status_code in (202, 409, 429, 503), answer.text

@@ -79,10 +79,10 @@ BODIES = {
         }
     ),
 }
-ABORT_MANY = "POST /retunes/{retune_id}/abort"
-RETUNES = ("POST /loops/{tag}/retune", "POST /retunes")
-RETUNES_MANY = ("POST /retunes", "POST /retunes/preview")
-MANY = {"pattern": "*", "requested_by": "M. Weber"}
+ABORT_MANY = "POST /batches/{batch_id}/abort"
+RETUNES = ("POST /loops/{tag}/retune", "POST /batches")
+RETUNES_MANY = ("POST /batches", "POST /batches/preview")
+MANY = {"pattern": "*", "by": "M. Weber"}
 KEYS = ("none", "wrong", "revoked", "expired", *Scope)
 
 
@@ -108,7 +108,7 @@ class Site:
         keyring.revoke(revoked.id)
         self.keys["wrong"] = self.keys["admin"][:-4] + "AAAA"
         self.jobs = [self.ended(None), self.ended(None), self.ended(Failed(Reason.NODE_LOST, "silent"))]
-        self.retunes: list[str] = []
+        self.batches: list[str] = []
         self.alarms: list[str] = []
         self.cases = 0
 
@@ -131,13 +131,13 @@ class Site:
         return job
 
     def retune(self, new: bool) -> str:
-        """A retune of many loops that is open; the service's thread for them does not run here."""
-        if new or not self.retunes:
-            self.retunes.append(self.client.post("/retunes", json=MANY).json()["id"])
-        return self.retunes[-1]
+        """A batch that is open; the service's thread for them does not run here."""
+        if new or not self.batches:
+            self.batches.append(self.client.post("/batches", json=MANY).json()["id"])
+        return self.batches[-1]
 
     def alarm(self) -> str:
-        """An alarm that may be signed off, or where there is none one that was."""
+        """An alarm that may be acknowledged, or where there is none one that was."""
         for each in self.client.get("/alarms").json():
             self.alarms.append(each["id"])
         return self.alarms[-1]
@@ -183,15 +183,15 @@ def test_what_the_document_allows(label: str, site: Site) -> None:
     def run(case: Any, known: bool, pick: int, body: Any) -> None:
         site.service.jobs.locking.unlock(TAG, "nobody")  # what an example before may have locked
         if known:  # else nearly every answer would be a 404
-            retune = site.retune(label == ABORT_MANY) if "retune_id" in case.path_parameters else ""
+            retune = site.retune(label == ABORT_MANY) if "batch_id" in case.path_parameters else ""
             alarm = site.alarm() if "alarm_id" in case.path_parameters else ""
             job = site.running() if label == ABORT else site.jobs[pick]
-            names = {"alarm_id": alarm, "tag": TAG, "job_id": job, "retune_id": retune}
+            names = {"alarm_id": alarm, "tag": TAG, "job_id": job, "batch_id": retune}
             if label in RETUNES_MANY:
                 case.body.pop("loops", None)
                 case.body["pattern"] = "*"
             if label in RETUNES and isinstance(case.body, dict):
-                case.body["requested_by"] = "M. Weber"  # no key names the caller
+                case.body["by"] = "M. Weber"  # no key names the caller
             case.body = case.body if body is None else body
             case.path_parameters.update({k: v for k, v in names.items() if k in case.path_parameters})
         answer = site.send(case)

@@ -35,7 +35,7 @@ def test_the_stored_history_is_answered_in_columns(service: Service, client: Tes
     assert (found["mode"][0], found["gains"][0]) == (None, None)
     assert (found["mode"][-1], found["gains"][-1], found["gain_sets"][0]["Kp"]) == ("automatic", 0, 1.5)
     assert [gap["to_s"] for gap in found["gaps"]] == [first_s, found["to_s"]]
-    assert found["not_heard"] == "listening is turned off" and found["to_s"] - found["from_s"] == 3600.0
+    assert found["no_data"] == "listening is turned off" and found["to_s"] - found["from_s"] == 3600.0
 
     few = client.get(f"/loops/{TAG}/history", params={"points": 1, "from": first_s + 20.0, "to": first_s + 30.0}).json()
     assert len(few["at_s"]) == 1 and not few["gaps"]

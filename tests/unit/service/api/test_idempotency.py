@@ -40,7 +40,7 @@ AT = datetime(2026, 1, 31, 12, tzinfo=UTC)
 
 
 def post(client: TestClient, path: str, body: dict[str, Any] | None = None, **headers: str) -> Any:
-    named = {"requested_by": "me"} if path.endswith("/retune") and body is None else {}
+    named = {"by": "me"} if path.endswith("/retune") and body is None else {}
     return client.post(path, json=body or named, headers=KEY | headers)
 
 
@@ -70,7 +70,7 @@ def running(service: Service) -> str:
 
 def a_retune(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
     service.tune.hold.clear()  # so that the second one would find the loop busy
-    return RETUNE, {"requested_by": "me"}
+    return RETUNE, {"by": "me"}
 
 
 def a_dry_run(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
@@ -78,7 +78,7 @@ def a_dry_run(service: Service, client: TestClient) -> tuple[str, dict[str, Any]
 
 
 def a_retune_of_many(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
-    return "/retunes", {"requested_by": "me", "pattern": "*"}
+    return "/batches", {"by": "me", "pattern": "*"}
 
 
 def an_acceptance(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
@@ -95,7 +95,7 @@ def an_abort(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]
 
 def an_abort_of_many(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
     service.tune.hold.clear()
-    found = client.post("/retunes", json={"requested_by": "me", "pattern": "*"}).json()
+    found = client.post("/batches", json={"by": "me", "pattern": "*"}).json()
     assert service.tune.inside.wait(10)
     return f"{found['url']}/abort", {}
 
@@ -104,8 +104,8 @@ def a_tuning(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]
     return "/tunings", MODEL
 
 
-def a_dismissal(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
-    return f"/loops/{TAG}/dismiss", {}
+def an_acknowledged_loop(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
+    return f"/loops/{TAG}/acknowledge", {}
 
 
 def a_lock(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
@@ -117,17 +117,17 @@ def an_unlock(service: Service, client: TestClient) -> tuple[str, dict[str, Any]
     return f"/loops/{TAG}/unlock", {}
 
 
-def a_sign_off(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
+def an_acknowledgement(service: Service, client: TestClient) -> tuple[str, dict[str, Any]]:
     service.tune.ends = Failed(Reason.NODE_LOST, "silent")
     service.wait(service.jobs.start(TAG, FastRetune()).id)
     (alarm,) = client.get("/alarms").json()
-    return f"/alarms/{alarm['id']}/sign-off", {"by": "me"}
+    return f"/alarms/{alarm['id']}/acknowledge", {"by": "me"}
 
 
 Asked = Callable[[Service, TestClient], tuple[str, dict[str, Any]]]
 EVERY: list[Asked] = [
-    a_retune, a_dry_run, a_retune_of_many, an_acceptance, a_rollback, an_abort, an_abort_of_many, a_tuning, a_dismissal,
-    a_lock, an_unlock, a_sign_off,
+    a_retune, a_dry_run, a_retune_of_many, an_acceptance, a_rollback, an_abort, an_abort_of_many, a_tuning,
+    an_acknowledged_loop, a_lock, an_unlock, an_acknowledgement,
 ]  # fmt: skip
 
 
@@ -135,7 +135,7 @@ def done(service: Service) -> tuple[int, int, int]:
     """Jobs, retunes of many and entries of the audit log."""
     return (
         len(service.store.recent()),
-        len(TestClient(app_of(service.jobs, checks={})).get("/retunes").json()),
+        len(TestClient(app_of(service.jobs, checks={})).get("/batches").json()),
         len(audit.trail(service.store.engine, 1000)),
     )
 
@@ -154,13 +154,13 @@ def test_repeated_with_its_key_it_is_done_once_and_answered_the_same(
     again = [post(client, path, body) for _ in range(3)]
     assert all(same(first, other) for other in again)
     assert was is None or done(service) == was
-    assert len(client.get("/retunes").json()) == (1 if "retunes" in path else 0)
+    assert len(client.get("/batches").json()) == (1 if "batches" in path else 0)
 
 
 def test_every_post_of_the_document_takes_the_key_and_says_so() -> None:
     document = json.loads(GOLDEN.read_text())
     posts = {path: item["post"] for path, item in document["paths"].items() if "post" in item}
-    paths = {path.replace("{tag}", "").replace("{job_id}", "").replace("{retune_id}", "") for path in posts}
+    paths = {path.replace("{tag}", "").replace("{job_id}", "").replace("{batch_id}", "") for path in posts}
     assert len(paths) >= 10
     for operation in posts.values():
         (key,) = [x for x in operation["parameters"] if x["name"] == "Idempotency-Key"]
@@ -184,8 +184,8 @@ def test_another_key_is_another_request(service: Service, client: TestClient) ->
 
 @pytest.mark.parametrize(
     ("path", "body"),
-    [(RETUNE, {"ms": 1.4}), (RETUNE, {"requested_by": "you"}), ("/loops/FIC-2/retune", {}), (f"{RETUNE}?x=1", {}),
-     ("/retunes", {"requested_by": "me", "pattern": "*"})],
+    [(RETUNE, {"Ms": 1.4}), (RETUNE, {"by": "you"}), ("/loops/FIC-2/retune", {}), (f"{RETUNE}?x=1", {}),
+     ("/batches", {"by": "me", "pattern": "*"})],
 )  # fmt: skip
 def test_the_same_key_with_another_request_is_refused_in_words(
     service: Service, client: TestClient, path: str, body: dict[str, Any]
@@ -260,9 +260,9 @@ def test_keys_are_of_who_asks(service: Service) -> None:
 
 
 def test_what_was_not_understood_may_be_corrected_under_the_same_key(service: Service, client: TestClient) -> None:
-    assert post(client, RETUNE, {"ms": 9}).status_code == 422
+    assert post(client, RETUNE, {"Ms": 9}).status_code == 422
     assert post(client, "/loops/NONE/retune").status_code == 404
-    assert post(client, RETUNE, {"ms": 1.4, "requested_by": "me"}).status_code == 202
+    assert post(client, RETUNE, {"Ms": 1.4, "by": "me"}).status_code == 202
 
 
 def test_what_failed_is_tried_anew(service: Service, client: TestClient) -> None:
@@ -373,7 +373,7 @@ def test_killed_between_the_effect_and_the_kept_answer(
     assert same(first, post(again, path, body))
     if asked is not a_retune_of_many:  # whose thread goes on making jobs
         assert done(service) == was
-    assert len(client.get("/retunes").json()) == (1 if "retunes" in path else 0)
+    assert len(client.get("/batches").json()) == (1 if "batches" in path else 0)
 
 
 def test_killed_before_the_effect(service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -550,10 +550,10 @@ def test_the_service_has_new_gains_once(service: Service, client: TestClient) ->
 
 def test_jobs_of_the_fleet_are_not_of_the_request(service: Service, client: TestClient) -> None:
     """The jobs that a retune of many begins later note nothing beside its key."""
-    first = post(client, "/retunes", {"requested_by": "me", "pattern": "*"})
-    assert isinstance(service.jobs, Jobs) and first.headers["location"].startswith("/retunes/")
+    first = post(client, "/batches", {"by": "me", "pattern": "*"})
+    assert isinstance(service.jobs, Jobs) and first.headers["location"].startswith("/batches/")
     for _ in range(2000):
         if client.get(first.headers["location"]).json()["ended_at"]:
             break
-    again = post(client, "/retunes", {"requested_by": "me", "pattern": "*"})
+    again = post(client, "/batches", {"by": "me", "pattern": "*"})
     assert len(service.store.recent()) == 2 and same(first, again)

@@ -157,13 +157,13 @@ def test_designs_that_are_stored_with_the_earlier_name_of_the_performance_are_re
 def test_the_designs_are_those_of_alternatives(here: Here, job: str) -> None:
     with here.client() as client:
         designs = client.get(f"/jobs/{job}/designs").json()
-        asked = client.get(f"/jobs/{job}/alternatives?ms=1.4").json()["methods"][0]
+        asked = client.get(f"/jobs/{job}/alternatives?Ms=1.4").json()["methods"][0]
         proposed = client.get(f"/jobs/{job}").json()
     (point,) = [each for each in designs["designs"] if each["Ms_asked"] == 1.4]
     for name in ("Kp", "Ti", "Td"):
         assert point["gains"][name] == pytest.approx(asked["gains"][name], rel=1e-6)
-    assert designs["after"]["Ms"] == pytest.approx(proposed["predicted"]["Ms"], abs=0.02)
-    assert designs["before"]["Ms"] == pytest.approx(proposed["comparison"]["before"]["Ms"], abs=0.05)
+    assert designs["new"]["Ms"] == pytest.approx(proposed["predicted"]["Ms"], abs=0.02)
+    assert designs["previous"]["Ms"] == pytest.approx(proposed["comparison"]["previous"]["Ms"], abs=0.05)
 
 
 def test_the_record_has_the_samples_and_what_the_model_leaves(here: Here, job: str) -> None:

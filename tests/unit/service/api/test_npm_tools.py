@@ -63,7 +63,7 @@ def test_a_typescript_client_compiles_and_retunes_a_loop(service: Service, folde
         "--moduleResolution", "nodenext", "--target", "es2022", "--outDir", "out",
     )  # fmt: skip
     wrong = folder / "wrong.ts"
-    wrong.write_text((folder / "retune.ts").read_text().replace("ms: 1.4", 'ms: "robust"'))
+    wrong.write_text((folder / "retune.ts").read_text().replace("Ms: 1.4", 'Ms: "robust"'))
     seen = run(*compiler, "wrong.ts", folder=folder)
     assert seen.returncode != 0 and "Type 'string' is not assignable to type 'number'" in seen.stdout, "types are seen"
     compiled = run(*compiler, "retune.ts", folder=folder)

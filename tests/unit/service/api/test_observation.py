@@ -46,15 +46,15 @@ def store_findings(service: Service) -> Callable[[], int]:
 
 
 @contextmanager
-def asked(service: Service, rings: Rings, not_heard: str | None = None) -> Iterator[TestClient]:
+def asked(service: Service, rings: Rings, no_data: str | None = None) -> Iterator[TestClient]:
     service.controller.state = replace(service.controller.state, gains=LOOP.gains, sample_time_s=LOOP.Ts)
-    app = app_of(service.jobs, listening=HeardBefore(rings, not_heard))
+    app = app_of(service.jobs, listening=HeardBefore(rings, no_data))
     with TestClient(app, raise_server_exceptions=False) as client:
         yield client
 
 
-def answer(service: Service, rings: Rings, not_heard: str | None = None, **query: Any) -> dict[str, Any]:
-    with asked(service, rings, not_heard) as client:
+def answer(service: Service, rings: Rings, no_data: str | None = None, **query: Any) -> dict[str, Any]:
+    with asked(service, rings, no_data) as client:
         found = client.get(f"/loops/{TAG}/observation", params=query)
         assert found.status_code == 200, found.text
         return dict(found.json())
@@ -70,19 +70,19 @@ def true_Ms(gains: dict[str, Any]) -> float:
 
 @pytest.mark.parametrize("ms", [1.4, 1.6])
 def test_three_set_point_changes_of_operators_are_a_proposal(service: Service, ms: float) -> None:
-    found = answer(service, heard(), ms=ms)
+    found = answer(service, heard(), Ms=ms)
     assert (found["state"], found["reason"]) == ("proposal", None), found["detail"]
     assert true_Ms(found["proposed"]["gains"]) == pytest.approx(ms, abs=0.05), "on the plant, not on the model"
     assert found["proposed"]["Ms"] == pytest.approx(ms, abs=0.01) and 0.0 < found["proposed"]["uncertainty"] < 0.06
     present = found["present"]
     assert abs(true_Ms(present["gains"]) - present["Ms"]) < max(0.03, present["uncertainty"])
     assert found["known"].endswith("from 3 set-point changes") and found["known"].startswith("Ms known to +-0.0")
-    begin_s = found["heard"]["to_s"] - 3799 * LOOP.Ts
+    begin_s = found["data"]["to_s"] - 3799 * LOOP.Ts
     assert [each["at_s"] - begin_s for each in found["changes_used"]] == pytest.approx([100.0, 190.0, 280.0], abs=0.2)
     assert [each["size"] for each in found["changes_used"]] == pytest.approx([1.0, 0.8, 0.9])
     assert found["changes_dropped"] == [] and found["model"]["dead_time_error_s"] > 0.0
     assert found["pv_range"]["low"] < 50.2 and found["pv_range"]["high"] > 50.9
-    assert found["tried"] is False and "never tried" in found["tried_text"]
+    assert found["tested_on_loop"] is False and "never tested" in found["tested_text"]
 
 
 def test_nothing_is_written_and_the_trial_is_a_request_that_is_taken(service: Service) -> None:
@@ -107,22 +107,22 @@ def test_a_load_that_comes_with_a_change_does_not_make_a_wrong_proposal(service:
 
 
 @pytest.mark.parametrize(
-    "rings, not_heard, word",
+    "rings, no_data, word",
     [
         (Rings(), "listening is turned off", "turned off"),
-        (Rings(), None, "nothing in automatic"),
+        (Rings(), None, "no data in automatic"),
         (heard({}), None, "no set-point change"),
-        (heard(unknown=range(3800)), None, "nothing in automatic"),
-        (heard(mode=lambda n: int(Mode.MANUAL)), None, "nothing in automatic"),
+        (heard(unknown=range(3800)), None, "no data in automatic"),
+        (heard(mode=lambda n: int(Mode.MANUAL)), None, "no data in automatic"),
         (heard({1000: 0.02}), None, "no set-point change of"),
     ],
     ids=["off", "nothing heard", "no change", "gains unknown", "in manual", "a change in the noise"],
 )
-def test_what_is_missing_is_said(service: Service, rings: Rings, not_heard: str | None, word: str) -> None:
-    found = answer(service, rings, not_heard)
+def test_what_is_missing_is_said(service: Service, rings: Rings, no_data: str | None, word: str) -> None:
+    found = answer(service, rings, no_data)
     assert (found["state"], found["reason"]) == ("missing", "uncertain")
     assert word in found["detail"] and found["advice"]
-    assert (found["proposed"], found["retune"], found["tried_text"]) == (None, None, None)
+    assert (found["proposed"], found["retune"], found["tested_text"]) == (None, None, None)
     assert found["present"]["gains"]["Kp"] == LOOP.gains.Kp
 
 
@@ -169,27 +169,27 @@ def test_the_test_of_a_neighbour_is_said_and_left_out(service: Service) -> None:
     service.tune.hold.clear()
     with asked(service, heard()) as client:
         assert client.get(f"/loops/{TAG}").json()["disturbed_by"] is None
-        job = client.post("/loops/FIC-2/retune", json={"requested_by": "me"}).json()
+        job = client.post("/loops/FIC-2/retune", json={"by": "me"}).json()
         assert service.tune.inside.wait(60)
         assert client.get(f"/loops/{TAG}").json()["disturbed_by"] == f"FIC-2 is under test (job {job['id']})"
         assert client.get("/loops/FIC-2").json()["disturbed_by"] is None, "it is the one under test"
         (disturbed,) = client.get(f"/loops/{TAG}/history").json()["disturbed"]
         assert disturbed["loop"] == "FIC-2" and disturbed["from_s"] < disturbed["to_s"] <= time.time()
         found = client.get(f"/loops/{TAG}/observation").json()
-        assert found["heard"]["disturbed_by"] == ["FIC-2"]
+        assert found["data"]["disturbed_by"] == ["FIC-2"]
         begun = datetime.fromisoformat(client.get(job["url"]).json()["started_at"]).timestamp()
-        assert found["heard"]["to_s"] is not None and found["heard"]["to_s"] <= begun, "what came before is used"
+        assert found["data"]["to_s"] is not None and found["data"]["to_s"] <= begun, "what came before is used"
         service.tune.hold.set()
         service.wait(job["id"])
         assert client.get(f"/loops/{TAG}").json()["disturbed_by"] is None
-        assert client.get("/loops/FIC-2/observation").json()["heard"]["disturbed_by"] == []
+        assert client.get("/loops/FIC-2/observation").json()["data"]["disturbed_by"] == []
 
 
 def test_a_silent_loop_an_unknown_one_and_a_wrong_question(service: Service) -> None:
     with asked(service, Rings()) as client:
         assert_problem(client.get("/loops/NONE/observation"), 404)
-        assert client.get(f"/loops/{TAG}/observation?ms=3").status_code == 422
-        job = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me", "method": "observe"})
+        assert client.get(f"/loops/{TAG}/observation?Ms=3").status_code == 422
+        job = client.post(f"/loops/{TAG}/retune", json={"by": "me", "method": "observe"})
         assert job.status_code == 422 and "GET /loops/TAG/observation" in job.text
         service.controller.absent = Reason.NODE_LOST
         assert client.get(f"/loops/{TAG}/observation").status_code == 503
@@ -252,8 +252,8 @@ def test_a_test_that_does_not_agree_is_of_an_older_plant(service: Service) -> No
         answered = client.get(f"/loops/{TAG}/observation").json()["knowledge"]
         found = client.get(f"/loops/{TAG}").json()["knowledge"]
     assert answered == found
-    assert found["source"] == "operation" and found["Ms"] == pytest.approx(1.75, abs=0.05) and found["agreeing"] == 0
-    assert "another one since" in found["older_plant"]
+    assert found["source"] == "operation" and found["Ms"] == pytest.approx(1.75, abs=0.05) and found["consistent"] == 0
+    assert "another one since" in found["superseded"]
 
 
 def test_the_command_shows_it(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -265,7 +265,7 @@ def test_the_command_shows_it(service: Service, monkeypatch: pytest.MonkeyPatch)
         for words in (
             f"{TAG}: Ms known to +-0.0",
             "from 3 set-point changes",
-            "never tried",
+            "never tested",
             '"start": "design"',
             "1.6 +-",
         ):

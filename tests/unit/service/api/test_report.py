@@ -6,8 +6,6 @@ import base64
 import hashlib
 import json
 import re
-import sqlite3
-from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -16,21 +14,16 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from loopwright.service.api.job_views import JobView, job_view
+from loopwright.service.api.job_views import JobView
 from loopwright.service.api.report import numbers
 from loopwright.service.api.report.drawing import around, ticks
 from loopwright.service.api.report.fingerprint import FIELDS
-from loopwright.service.api.report.paper import ReportSource, paper
 from loopwright.service.api.report.words import mark_names, stage_name
-from loopwright.service.jobs.job_figures import job_figures
 from loopwright.service.results import GainsView
-from loopwright.service.store.database import FILE
-from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import ADVICE, Failed, Reason, Refused
 from tests.unit.service import fakes
 from tests.unit.service.api.test_api import assert_problem, finished, start
 from tests.unit.service.fakes import NEW, OLD, RESULT, Service
-from tests.unit.service.store.test_results_migrated import GOLDEN, SQL
 
 MARKUP = "<script>alert(1)</script> & <!-- \"'"
 VOID = {"meta", "link", "img", "br", "hr", "input", "base"}
@@ -109,7 +102,7 @@ def recomputed(client: TestClient, job: str) -> str:
 
 
 def test_a_proposal(service: Service, client: TestClient) -> None:
-    job = finished(service, client, requested_by="A. Lind")
+    job = finished(service, client, by="A. Lind")
     answer, document = report(client, job["id"])
     assert_self_contained(answer, document)
     assert "New gains are proposed" in document.text and "A. Lind" in document.text
@@ -132,8 +125,8 @@ def test_the_hash_is_recomputed_and_outlives_the_decision(service: Service, clie
     assert "The new gains were accepted by C. Berg" in document.text
     client.post(f"/jobs/{job}/rollback", json={"by": "D. Roth"})
     text = report(client, job)[1].text
-    assert "The new gains were accepted first, and the old ones put back by D. Roth" in text
-    assert "The old gains were kept" not in text
+    assert "The new gains were accepted first, and the previous ones put back by D. Roth" in text
+    assert "The previous gains were kept" not in text
     fakes.add_samples(service.store, job, "relay", service.store.samples(job)[0][1][:1])
     assert recomputed(client, job) != expected and recomputed(client, job) in report(client, job)[1].text
 
@@ -141,11 +134,11 @@ def test_the_hash_is_recomputed_and_outlives_the_decision(service: Service, clie
 def test_markup_in_what_people_and_devices_say_stays_text(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fakes, "RESULT", RESULT.model_copy(update={"notes": [MARKUP], "chosen": {MARKUP: 1.0}}))
+    monkeypatch.setattr(fakes, "RESULT", RESULT.model_copy(update={"notes": [MARKUP], "design": {MARKUP: 1.0}}))
     told = {"description": MARKUP, "pv_unit": MARKUP, "area": MARKUP}
     config = service.loops["TIC-101"].model_copy(update=told)
     monkeypatch.setitem(service.loops, "TIC-101", config)
-    job = finished(service, client, requested_by=MARKUP)["id"]
+    job = finished(service, client, by=MARKUP)["id"]
     client.post(f"/jobs/{job}/accept", json={"by": MARKUP})
     answer, document = report(client, job)
     assert_self_contained(answer, document)
@@ -155,8 +148,8 @@ def test_markup_in_what_people_and_devices_say_stays_text(
 @pytest.mark.parametrize(
     ("ends", "headline"),
     [
-        (Refused(Reason.NOT_AT_REST, "PV moved by 3 <degC>"), "No result to trust: not at rest"),
-        (Failed(Reason.NODE_LOST, "node 32 does not answer"), "Failed: the node was lost"),
+        (Refused(Reason.NOT_AT_REST, "PV moved by 3 <degC>"), "Refused: not at rest"),
+        (Failed(Reason.NODE_LOST, "node 32 does not answer"), "Failed: node lost"),
         (RuntimeError("defect"), "Failed: an error inside the service"),
     ],
 )
@@ -178,7 +171,7 @@ def test_a_job_stopped_by_somebody(service: Service, client: TestClient) -> None
     service.wait(job)
     answer, document = report(client, job)
     assert_self_contained(answer, document)
-    assert "Stopped: by an operator" in document.text and "B. Holm" in document.text
+    assert "Aborted: by an operator" in document.text and "B. Holm" in document.text
     assert "At the end the loop was read back: automatic" in document.text
 
 
@@ -203,32 +196,6 @@ def test_gains_that_are_not_stable_on_the_model(
     answer, document = report(client, job)
     assert_self_contained(answer, document)
     assert "not stable" in document.text
-
-
-@pytest.fixture(scope="module")
-def old(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
-    """A database of revision 0008, migrated."""
-    folder = tmp_path_factory.mktemp("old")
-    connection = sqlite3.connect(folder / FILE)
-    connection.executescript(SQL)
-    connection.close()
-    store = Store(folder)
-    yield store
-    store.close()
-
-
-@pytest.mark.parametrize("name", GOLDEN["jobs"])
-def test_jobs_of_an_old_database(old: Store, name: str) -> None:
-    row = old.get(GOLDEN["jobs"][name]["id"])
-    events, blocks = old.events(row.id), list(old.blocks(row.id))
-    found = job_figures(row, events, blocks)
-    view = job_view(row, events, None)
-    source = ReportSource(view, None, events, found.record, found.designs, blocks, "0.1.0", "2026-01-31T12:00:00.000Z")
-    document = Document(paper(source))
-    assert row.id in document.text and "nan" not in document.text
-    if view.new_gains is not None:
-        assert numbers.significant(view.new_gains.Kp) in document.text
-        assert found.designs is not None and any(each.gains for each in found.designs.designs)
 
 
 def test_the_document_has_the_fields_of_the_hash() -> None:
@@ -259,6 +226,8 @@ def test_numbers(value: float | None, text: str) -> None:
 
 def test_a_step_that_follows_a_relay_is_said_not_to_begin_at_rest() -> None:
     """Its overshoot in the picture is not that of the gains."""
-    assert mark_names(["preflight", "relay", "design", "verify"])[-1] == "Step, from where the relay left PV"
-    assert mark_names(["preflight", "pulses", "design", "verify"])[-1] == "Step, from where the pulses left PV"
+    assert mark_names(["preflight", "relay", "design", "verify"])[-1] == "Set-point step, from where the relay left PV"
+    assert (
+        mark_names(["preflight", "pulses", "design", "verify"])[-1] == "Set-point step, from where the pulses left PV"
+    )
     assert mark_names(["preflight", "verify"])[-1] == stage_name("verify")

@@ -108,7 +108,7 @@ def test_what_a_change_must_show(browsers: Browsers, headers: dict[str, str], wi
     if without:
         del browser.headers[CSRF]
     sent = {name: value.encode("latin-1") for name, value in headers.items()}
-    answer = browser.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}, headers=sent)
+    answer = browser.post(f"/loops/{TAG}/retune", json={"by": "me"}, headers=sent)
     assert answer.status_code == status
     if status == 403:
         assert any(word in assert_problem(answer, 403)["detail"] for word in ("/session", "/ui/"))
@@ -131,9 +131,7 @@ def test_bearer_keys_are_as_before(browsers: Browsers) -> None:
     bearer = {"Authorization": f"Bearer {browsers.keyring.create('script', Scope.OPERATE)[1]}"}
     assert browser.get("/session", headers=bearer).json()["name"] == "script"
     assert browser.get("/session", headers=bearer).json()["csrf"] is None
-    answer = browser.post(
-        f"/loops/{TAG}/retune", json={"requested_by": "me"}, headers=bearer | {"Origin": "https://any.example"}
-    )
+    answer = browser.post(f"/loops/{TAG}/retune", json={"by": "me"}, headers=bearer | {"Origin": "https://any.example"})
     assert answer.status_code == 202
     assert_problem(browser.delete("/session", headers=bearer), 409)
     assert browser.get("/loops", headers={"Authorization": "Bearer wrong"}).status_code == 401
@@ -142,7 +140,7 @@ def test_bearer_keys_are_as_before(browsers: Browsers) -> None:
 @pytest.mark.parametrize("has", Scope)
 def test_scopes_are_those_of_the_key(browsers: Browsers, has: Scope) -> None:
     browser = browsers.signed_in(has)
-    answer = browser.post(f"/loops/{TAG}/retune", json={"requested_by": "me"})
+    answer = browser.post(f"/loops/{TAG}/retune", json={"by": "me"})
     assert answer.status_code == (403 if has is Scope.READ else 202)
     assert browser.get("/audit").status_code == (200 if has is Scope.ADMIN else 403)
 
@@ -155,7 +153,7 @@ def test_signing_out(browsers: Browsers) -> None:
     browser.cookies.update(cookie)
     assert "sign in again" in assert_problem(browser.get("/loops"), 401)["detail"]
     assert [each.what for each in browsers.trail()] == ["sign_out", "sign_in"]
-    assert {each.who for each in browsers.trail()} == {"control room"}
+    assert {each.key for each in browsers.trail()} == {"control room"}
 
 
 @pytest.mark.parametrize("scheme", ["http", "https"])
@@ -227,7 +225,7 @@ def test_wrong_keys_are_slowed_down_and_written_down(browsers: Browsers) -> None
     assert browser.get("/loops", headers=bearer).status_code == 429  # the same guesses
     found = browsers.trail()
     assert [each.what for each in found] == ["sign_in_refused"] * 5  # and no more
-    assert (found[-1].who, found[-1].subject) == ("unknown", row.id) and found[-1].after["key"] == "control room"
+    assert (found[-1].key, found[-1].subject) == ("unknown", row.id) and found[-1].after["key"] == "control room"
     assert not any(part in str([each.after for each in found]) for part in (wrong, wrong[16:]))
 
 

@@ -96,7 +96,8 @@ def test_the_options_of_fast_are_asked_for(service: Service, through: Through) -
         "2",
         "--amplitude",
         "10",
-        "--careful",
+        "--min-switches",
+        "6",
         "--no-verify",
         "--no-wait",
         "--json",
@@ -106,12 +107,12 @@ def test_the_options_of_fast_are_asked_for(service: Service, through: Through) -
     assert result.exit_code == 0, result.output
     (body,) = through.posted
     assert body == {
-        "ms": 1.4, "derivative": True, "aim": "no_overshoot", "settling_s": 300.0, "mv_peak": 4.0, "noise_gain": 2.0,
-        "amplitude_pct": 10.0, "careful": True, "verify": False, "requested_by": "cli",
+        "Ms": 1.4, "derivative": True, "aim": "no_overshoot", "settling_s": 300.0, "mv_peak": 4.0, "noise_gain": 2.0,
+        "amplitude_pct": 10.0, "min_switches": 6, "verify": False, "by": "cli",
     }  # fmt: skip
     job = json.loads(result.stdout)
     service.wait(job["id"])
-    assert job["method"] == "fast" and job["request"]["ms"] == 1.4 and job["request"]["aim"] == "no_overshoot"
+    assert job["method"] == "fast" and job["request"]["Ms"] == 1.4 and job["request"]["aim"] == "no_overshoot"
 
 
 def test_to_where_and_how_fast_the_set_point_may_move_is_asked_for(service: Service, through: Through) -> None:
@@ -119,13 +120,13 @@ def test_to_where_and_how_fast_the_set_point_may_move_is_asked_for(service: Serv
                  "--no-wait", "--json", "--yes")  # fmt: skip
     assert result.exit_code == 0, result.output
     (body,) = through.posted
-    assert body == {"method": "setpoint", "directions": "down", "sp_rate_max_per_s": 0.5, "requested_by": "cli"}
+    assert body == {"method": "setpoint", "directions": "down", "sp_rate_max_per_s": 0.5, "by": "cli"}
     service.wait(json.loads(result.stdout)["id"])
 
 
 def test_a_proposal_all_the_same_is_asked_for(service: Service, through: Through) -> None:
     result = run("retune", TAG, "--propose-anyway", "--no-wait", "--json", "--yes")
-    assert through.posted == [{"propose_anyway": True, "requested_by": "cli"}]
+    assert through.posted == [{"propose_anyway": True, "by": "cli"}]
     service.wait(json.loads(result.stdout)["id"])
 
 
@@ -173,7 +174,7 @@ def test_on_a_terminal_a_retune_says_what_it_does_and_asks(
     if jobs:
         assert through.posted[0] == through.posted[1]
         report = result.stdout[result.stdout.index("{") :]  # before it, the answer as the runner echoes it
-        assert json.loads(report)["request"]["ms"] == 1.4
+        assert json.loads(report)["request"]["Ms"] == 1.4
         service.wait(rows[0].id)
 
 
@@ -219,11 +220,11 @@ def test_a_job_and_its_picture_and_another_Ms(rehearsed: str, tmp_path: Path) ->
     shown = run("job", rehearsed, "--plot", str(picture))
     assert shown.exit_code == 0, shown.output
     assert picture.stat().st_size > 20_000
-    for words in ("predicted overshoot", "model num", "uncertainty of Ms", "fit of measured step"):
+    for words in ("predicted overshoot", "model K", "uncertainty of Ms", "fit of measured step"):
         assert words in shown.output
     found = run("alternatives", rehearsed, "--ms", "1.4", "--json")
     (fast,) = json.loads(found.stdout)["methods"]
-    assert fast["retune"]["start"] == "design" and fast["retune"]["ms"] == 1.4 and fast["uncertainty"] < 0.1
+    assert fast["retune"]["start"] == "design" and fast["retune"]["Ms"] == 1.4 and fast["uncertainty"] < 0.1
     told = run("alternatives", rehearsed, "--ms", "1.4")
     assert told.exit_code == 0 and '"start": "design"' in told.output.replace("\n", " ")
     assert run("job", rehearsed, "--plot", "job.doc").exit_code == 2
@@ -234,7 +235,7 @@ def test_other_gains_for_the_model_of_a_job(rehearsed: str, service: Service, th
     begun = run("retune", TAG, "--from", rehearsed[:8], "--ms", "1.4", *options)
     assert begun.exit_code == 0, begun.output
     asked = through.posted[-1]
-    assert asked["start"] == "design" and asked["ms"] == 1.4 and asked["model"] and asked["requested_by"] == "cli"
+    assert asked["start"] == "design" and asked["Ms"] == 1.4 and asked["model"] and asked["by"] == "cli"
     service.wait(json.loads(begun.stdout)["id"])
     by_rule = run("retune", TAG, "--from", "last", "--method", "lambda", *options)
     assert by_rule.exit_code == 0 and through.posted[-1]["method"] == "lambda", by_rule.output
@@ -269,7 +270,7 @@ class TestWhichJob:
     def ids(self, service: Service, through: Through) -> list[str]:
         found = []
         for _ in range(3):
-            found.append(str(through.post(f"/loops/{TAG}/retune", {"requested_by": "me"})["id"]))
+            found.append(str(through.post(f"/loops/{TAG}/retune", {"by": "me"})["id"]))
             service.wait(found[-1])
         return found
 
@@ -330,7 +331,7 @@ class TestWhichJob:
 
 
 def test_ids_and_times_are_whole_on_eighty_columns(service: Service, through: Through) -> None:
-    job = through.post(f"/loops/{TAG}/retune", {"requested_by": "me"})["id"]
+    job = through.post(f"/loops/{TAG}/retune", {"by": "me"})["id"]
     service.wait(job)
     (line,) = (line for line in run("jobs").output.splitlines() if TAG in line)
     assert job in line and " s ago" in line and len(line) <= 80
@@ -392,10 +393,10 @@ class TestFollowing:
 
     def test_a_retune_of_many_loops(self, through: Through, ended: BaseException) -> None:
         result = run("retune", "TIC-*", "--yes")
-        (retune,) = through.get("/retunes")
-        said = self.said(result, ended, f"retune {retune['id']}")
-        assert said.startswith(f"retune {retune['id']} of 1 loops\n")
-        assert f"{through.url}{retune['url']}/abort" in said and "loopwright retunes" in said
+        (retune,) = through.get("/batches")
+        said = self.said(result, ended, f"batch {retune['id']}")
+        assert said.startswith(f"batch {retune['id']} of 1 loops\n")
+        assert f"{through.url}{retune['url']}/abort" in said and "loopwright batches" in said
 
 
 def test_how_long_ago() -> None:
@@ -411,10 +412,10 @@ def test_how_long_ago() -> None:
 
 
 def test_the_retunes_of_many_loops(service: Service, through: Through) -> None:
-    retune = through.post("/retunes", {"requested_by": "me", "pattern": "*"})["id"]
-    listed = run("retunes")
+    retune = through.post("/batches", {"by": "me", "pattern": "*"})["id"]
+    listed = run("batches")
     assert listed.exit_code == 0 and retune in listed.output and " s ago" in listed.output
-    assert json.loads(run("retunes", "--json").stdout)[0]["id"] == retune
+    assert json.loads(run("batches", "--json").stdout)[0]["id"] == retune
 
 
 def test_the_version() -> None:
@@ -423,7 +424,7 @@ def test_the_version() -> None:
 
 
 def test_a_job_without_a_record_has_no_picture(service: Service, through: Through, tmp_path: Path) -> None:
-    job = through.post(f"/loops/{TAG}/retune", {"requested_by": "me"})["id"]
+    job = through.post(f"/loops/{TAG}/retune", {"by": "me"})["id"]
     service.wait(job)
     result = run("job", job, "--plot", str(tmp_path / "job.png"))
     assert result.exit_code == 1 and "neither a relay's record nor a set-point step" in result.output
@@ -432,7 +433,7 @@ def test_a_job_without_a_record_has_no_picture(service: Service, through: Throug
 @pytest.fixture
 def proposed(service: Service, through: Through) -> str:
     """The id of a job whose proposal waits for a decision, and which has no record to be drawn."""
-    job = through.post(f"/loops/{TAG}/retune", {"requested_by": "me"})["id"]
+    job = through.post(f"/loops/{TAG}/retune", {"by": "me"})["id"]
     service.wait(job)
     assert service.store.get(job).state == "proposed"
     through.paths.clear()
@@ -488,9 +489,9 @@ def test_rehearse_is_fast_unless_told_otherwise(tmp_path: Path) -> None:
     file = tmp_path / "plant.json"
     file.write_text(json.dumps(PLANT))
     answer = json.loads(run("rehearse", str(file), "--ms", "1.4", "--json").stdout)
-    assert (answer["method"], answer["chosen"]) == ("fast", {"Ms": 1.4})
+    assert (answer["method"], answer["design"]) == ("fast", {"Ms": 1.4})
     assert answer["predicted"]["Ms"] == pytest.approx(1.4, abs=0.01)
-    assert answer["predicted_before"]["Ms"] < 1.4
+    assert answer["predicted_previous"]["Ms"] < 1.4
     assert json.loads(run("rehearse", str(file), "--method", "five-stage", "--json").stdout)["method"] == "five-stage"
     assert run("rehearse", str(file), "--method", "five-stage", "--ms", "1.4").exit_code == 2
     for name in ("--settling-s", "--mv-peak", "--noise-gain"):
@@ -506,7 +507,13 @@ def test_rehearse_speaks_like_retune(tmp_path: Path) -> None:
     file.write_text(json.dumps({"name": "heater", "K": 0.8, "T_s": 120, "L_s": 15, "noise_std": 0.0005}))
     shown = run("rehearse", str(file))
     assert shown.exit_code == 0, shown.output
-    for words in ("Relay: ", "Model and gains: ", "rehearsal on heater", "predicted overshoot", "MV unit per PV unit"):
+    for words in (
+        "Relay test: ",
+        "Model and gains: ",
+        "rehearsal on heater",
+        "predicted overshoot",
+        "MV unit per PV unit",
+    ):
         assert words in shown.output
     assert "{" not in shown.output
     echoed = json.loads(run("rehearse", str(file), "--json").stdout)["input"]

@@ -103,7 +103,7 @@ def test_one_method_by_its_equation() -> None:
     (simc,) = found["methods"]
     # Kp = T/(K (tau_c + L)), Ti = min(T, 4 (tau_c + L))
     assert simc["gains"]["Kp"] == pytest.approx(10.0 / (2.0 * 12.0)) and simc["gains"]["Ti"] == 10.0
-    assert simc["chosen"]["tau_c_s"] == 4.0
+    assert simc["design"]["tau_c_s"] == 4.0
     # pole and zero cancel: the loop is k e^(-Ls)/s with k = 1/12, of known margins
     assert simc["margins"]["GM"] == pytest.approx(math.pi / 2 * 12.0 / 8.0, rel=1e-6)
     assert simc["margins"]["PM_deg"] == pytest.approx(90.0 - math.degrees(8.0 / 12.0), rel=1e-6)

@@ -59,7 +59,7 @@ def test_a_broken_connection_is_repeated_once_with_the_same_key(
     monkeypatch: pytest.MonkeyPatch, broken: Exception
 ) -> None:
     client, sent = through(monkeypatch, broken, httpx.Response(202, json={"id": "x"}))
-    assert client.post("/loops/TIC-101/retune", {"ms": 1.4}) == {"id": "x"}
+    assert client.post("/loops/TIC-101/retune", {"Ms": 1.4}) == {"id": "x"}
     first, second = keys(sent)
     assert first == second and len(first) == 32 and sent[0].content == sent[1].content
     client, sent = through(monkeypatch, broken, broken)
@@ -112,10 +112,10 @@ def test_a_service_that_is_there_is_not_said_to_be_missing(
 def test_what_the_service_computes_is_waited_for_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     client, sent = through(monkeypatch, *(httpx.Response(200, json={}) for _ in range(3)), httpx.ReadTimeout("late"))
     client.get("/loops")
-    client.computed("/loops/TIC-101/observation", ms=1.4, aim=None)
+    client.computed("/loops/TIC-101/observation", Ms=1.4, aim=None)
     client.file("/jobs/x/report")
     assert [each.extensions["timeout"]["read"] for each in sent] == [30.0, 300.0, 300.0]
-    assert sent[1].extensions["timeout"]["connect"] == 30.0 and sent[1].url.query == b"ms=1.4"
+    assert sent[1].extensions["timeout"]["connect"] == 30.0 and sent[1].url.query == b"Ms=1.4"
     with pytest.raises(ApiError, match="has not answered GET /loops/TIC-101/observation within 300 s"):
         client.computed("/loops/TIC-101/observation")
 
@@ -175,9 +175,10 @@ def test_another_program_at_the_address_is_named_as_such(
     ("command", "answer"),
     [("loops", [{"name": "TIC-101"}]), ("jobs", [{"id": 7}]), ("job 0123456789ab", {"id": "0123456789ab"}),
      ("job 0123456789ab --accept", {"id": "0123456789ab"}), ("job 0123456789ab --follow", {"state": "pondering"}),
-     ("loop TIC-101", {}), ("observe TIC-101", {}), ("alarms", {"alarms": None}), ("retunes", [{}]),
-     ("webhooks", [{}]), ("retune TIC-101 --preview", {}), ("retune TIC-101 --yes --wait", {}), ("dismiss TIC-101", {}),
-     ("lock TIC-101 --reason valve", {}), ("unlock TIC-101", {}), ("alternatives 0123456789ab", {})],
+     ("loop TIC-101", {}), ("observe TIC-101", {}), ("alarms", {"alarms": None}), ("batches", [{}]),
+     ("webhooks", [{}]), ("retune TIC-101 --preview", {}), ("retune TIC-101 --yes --wait", {}),
+     ("acknowledge TIC-101", {}), ("lock TIC-101 --reason valve", {}), ("unlock TIC-101", {}),
+     ("alternatives 0123456789ab", {})],
 )  # fmt: skip
 def test_a_service_of_another_version_is_named_as_such(
     monkeypatch: pytest.MonkeyPatch, command: str, answer: object
@@ -195,7 +196,7 @@ def test_pages_are_lists(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(
     ("body", "why"),
-    [({"ms": math.nan, "T95_s": 60.0}, "^ms: a finite number"), ({"reason": "\udcff"}, "no UTF-8")],
+    [({"Ms": math.nan, "T95_s": 60.0}, "^Ms: a finite number"), ({"reason": "\udcff"}, "no UTF-8")],
     ids=["no number", "no text"],
 )
 def test_what_cannot_be_sent_is_not_sent(monkeypatch: pytest.MonkeyPatch, body: dict[str, object], why: str) -> None:

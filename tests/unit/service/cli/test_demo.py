@@ -103,7 +103,7 @@ def test_each_method_retunes_the_same_loop_and_the_table_is_of_the_plant(
     report(in_memory, demo.TAG, shown, PLANT_MODEL)
     assert not shown.without_proposal
     assert [job.method for job in shown.jobs] == ["five-stage", "fast", "setpoint"]
-    assert {(job.old_gains.Kp, job.old_gains.Ti) for job in shown.jobs if job.old_gains} == {(KP, TI)}
+    assert {(job.previous_gains.Kp, job.previous_gains.Ti) for job in shown.jobs if job.previous_gains} == {(KP, TI)}
     table = lines(screen.getvalue())
     Ku = [float(table[stage][1].split("Ku ")[1].removeprefix("about ").split(",")[0]) for stage in list(table)[:2]]
     assert Ku[0] == pytest.approx(205, rel=0.1) and Ku[1] == pytest.approx(205, rel=0.015)
@@ -138,7 +138,7 @@ def test_a_retune_that_is_on_its_way_is_followed_instead_of_starting_others(
     service: Service, through: Through, screen: io.StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service.tune.hold.clear()
-    begun = through.post(f"/loops/{TAG}/retune", {"requested_by": "me", "method": "fast"})
+    begun = through.post(f"/loops/{TAG}/retune", {"by": "me", "method": "fast"})
     assert service.tune.inside.wait(20)
     follow = job_tables.follow
 

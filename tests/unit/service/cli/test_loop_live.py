@@ -20,11 +20,11 @@ from loopwright.service.live.messages import RETRY_MS, LiveJob, LiveJobs, LiveLo
 
 ROW: dict[str, Any] = {
     "tag": "TIC-101", "pv": 64.98, "sp": 65.0, "mv": 40.1, "mode": "automatic", "age_s": 0.1, "under_test": False,
-    "on_trial": False, "not_heard": None, "host": "local", "job": None, "last_job": None,
+    "on_trial": False, "no_data": None, "gateway": "local", "job": None, "last_job": None,
 }  # fmt: skip
 JOB: dict[str, Any] = {
-    "id": "4f0c2a9be113", "url": "/jobs/4f0c2a9be113", "loop": "TIC-101", "host": "local", "state": "running",
-    "dry_run": False, "requested_by": "me", "stage": "relay", "progress": 0.42, "remaining_plant_time_s": 31.2,
+    "id": "4f0c2a9be113", "url": "/jobs/4f0c2a9be113", "loop": "TIC-101", "gateway": "local", "state": "running",
+    "dry_run": False, "by": "me", "stage": "relay", "progress": 0.42, "remaining_plant_time_s": 31.2,
     "remaining_wall_time_s": 31.2,
     "plant_time_s": 22.7, "stopping": False,
 }  # fmt: skip
@@ -64,13 +64,13 @@ def text(*messages: str) -> httpx.Response:
 def test_a_line_for_each_second_with_the_job_that_has_the_loop(capsys: pytest.CaptureFixture[str]) -> None:
     job = event("jobs", LiveJobs(jobs=[LiveJob(**JOB)]))
     under_test = {"job": JOB["url"], "mode": "experiment", "under_test": True}
-    silent = {"pv": None, "sp": None, "mv": None, "mode": None, "not_heard": "no data for 4 s"}
+    silent = {"pv": None, "sp": None, "mv": None, "mode": None, "no_data": "no data for 4 s"}
     client = streaming(text(rows({}, {"tag": "B"}), job, rows(under_test), rows(silent)))
     loop_live.follow(client, "TIC-101", "degC", Console(), as_json=False)
     one, two, three, lost = capsys.readouterr().out.splitlines()
     assert one.endswith("  SP 65.00 degC, PV 64.98 degC, MV 40.10 %, automatic")
     assert two.endswith("experiment, job 4f0c2a9be113: relay 42%, about 31 s of plant time left")
-    assert three.endswith("  not heard: no data for 4 s")
+    assert three.endswith("  no data: no data for 4 s")
     assert lost == "the service at http://gateway has ended the stream, it is tried again"
 
 
@@ -89,11 +89,11 @@ def test_json_is_an_object_a_line(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_terminal_has_one_table(capsys: pytest.CaptureFixture[str]) -> None:
     console = Console(force_terminal=True, width=100)
-    other = {"under_test": True, "on_trial": True, "not_heard": "no data for 4 s"}
+    other = {"under_test": True, "on_trial": True, "no_data": "no data for 4 s"}
     loop_live.follow(streaming(text(rows({}), rows(other))), "TIC-101", "degC", console, as_json=False)
     shown = capsys.readouterr().out
     assert "TIC-101 at " in shown and "64.98 degC" in shown and "no test" in shown
-    assert "under test by another tuner" in shown and "gains on trial" in shown and "not heard: no data" in shown
+    assert "under test by another tuner" in shown and "gains on trial" in shown and "no data: no data" in shown
 
 
 def test_an_unknown_loop_is_an_error() -> None:

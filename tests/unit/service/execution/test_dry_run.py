@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from fastapi.testclient import TestClient
-from sqlalchemy import text
 
 from loopwright.service.api.job_views import JobView, job_view
-from loopwright.service.api.metrics import exposition, registry
 from loopwright.service.cli import job_tables
 from loopwright.service.execution.procedures import Hooks, rehearse
 from loopwright.service.inputs.model_json import TransferFunctionModel
@@ -108,7 +105,7 @@ def test_a_dry_run_takes_the_model_that_the_last_job_found_and_the_gains_of_the_
     assert view.state is JobState.REHEARSED and on is not None
     assert (on.plant_source, on.plant_job, on.num, on.dead_time_s) == ("last_model", f"/jobs/{job_id}", [2.0], 1.0)
     assert on.plant_job_ended_at == service.store.get(job_id).ended_at
-    assert on.gains_source == "controller" and view.old_gains is not None and view.old_gains.Kp == OLD.Kp
+    assert on.gains_source == "controller" and view.previous_gains is not None and view.previous_gains.Kp == OLD.Kp
     assert view.comparison is not None and view.comparison.verdict
     assert any(f"the model that job {job_id} found" in note for note in view.notes)
     title = job_tables.title(view)
@@ -148,7 +145,7 @@ def test_then_the_gains_are_those_that_the_last_job_left(service: Service) -> No
     view = dry_run(service)
     on = view.rehearsed_on
     assert on is not None and (on.gains_source, on.gains_job) == ("last_job", f"/jobs/{job_id}")
-    assert view.old_gains is not None and view.old_gains.Kp == NEW.Kp
+    assert view.previous_gains is not None and view.previous_gains.Kp == NEW.Kp
     assert f"as job {job_id} found them" in on.gains_text
 
 
@@ -161,7 +158,7 @@ def test_beside_a_test_the_gains_are_those_from_before_it(tmp_path: Path) -> Non
     row = service.jobs.start(TAG, retune_request(**QUICK))
     service.wait(row.id)
     view = shown(service, row.id)
-    assert view.old_gains is not None and view.old_gains.Kp == OLD.Kp
+    assert view.previous_gains is not None and view.previous_gains.Kp == OLD.Kp
     service.tune.hold.set()
     service.wait(live.id)
     service.close()
@@ -202,23 +199,3 @@ def test_a_sample_time_too_short_for_a_rehearsal_is_replaced_and_that_is_said(se
     config = service.loops[TAG].model_copy(update={"t95_s": 30_000.0})
     spec, on = rehearsal_spec(config, retune_request(dry_run=True), ground_with(service))
     assert "sample_time_s" not in spec and "the sample time 0.1 s is too short for this T95" in on.gains_text
-
-
-def test_dry_runs_of_earlier_versions_are_shown_as_rehearsed(service: Service, client: TestClient) -> None:
-    row = service.store.create(TAG, {"start": "relay"}, "me", True)
-    with service.store.engine.begin() as connection:
-        connection.execute(text("UPDATE jobs SET state = 'proposed' WHERE id = :id"), {"id": row.id})
-    assert RESULT.comparison is None
-    service.store.note(row.id, result=RESULT, old_gains=asdict(OLD))
-    live = proposed(service)
-    job = client.get(f"/jobs/{row.id}").json()
-    assert (job["state"], job["comparison"], job["rehearsed_on"]) == ("rehearsed", None, None)
-    assert [each["id"] for each in client.get("/jobs?state=rehearsed").json()] == [row.id]
-    assert [each["id"] for each in client.get("/jobs?state=proposed").json()] == [live]
-    for decision in ("accept", "rollback"):
-        assert client.post(f"/jobs/{row.id}/{decision}").status_code == 409
-    assert service.controller.state.gains == OLD
-    told = exposition(registry(service.loops, service.store, {})).decode()
-    assert 'loopwright_jobs{reason="",state="rehearsed"} 1.0' in told
-    assert 'loopwright_jobs{reason="",state="proposed"} 1.0' in told
-    job_tables.job_report(JobView.model_validate(job))

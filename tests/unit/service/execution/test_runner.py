@@ -156,7 +156,7 @@ def test_what_is_opened_and_what_must_come_back_is_told() -> None:
             note_session: Callable[[int], None] = lambda session: None,
         ) -> LoopState:
             note_session(7)
-            return replace(super().begin(), when_silent="holds MV where it is")
+            return replace(super().begin(), fail_action="holds MV where it is")
 
     loop = Numbered()
     home = loop.read()
@@ -164,8 +164,8 @@ def test_what_is_opened_and_what_must_come_back_is_told() -> None:
         trial(), loop, limits=RunLimits(), note_session=told.append, on_home=told.append,
         on_event=lambda e: told.append(e.text) if isinstance(e, Note) else None,
     )  # fmt: skip
-    silent = "if the controller falls silent, the plant's I/O holds MV where it is"
-    assert told == [7, replace(home, when_silent="holds MV where it is"), silent]
+    silent = "if the controller fails, the plant's I/O holds MV where it is"
+    assert told == [7, replace(home, fail_action="holds MV where it is"), silent]
 
 
 def test_a_stop_ends_the_wait_for_the_loop() -> None:

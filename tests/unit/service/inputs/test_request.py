@@ -33,19 +33,19 @@ MODEL = {"K": 2.0, "T_s": 10.0, "L_s": 3.0}
 )
 def test_the_method_chooses_the_kind(method: str | None, kind: type, fleet: type) -> None:
     named = {} if method is None else {"method": method}
-    request = retune_request(**named, verify=False, requested_by="me")
+    request = retune_request(**named, verify=False, by="me")
     assert type(request) is kind and request.method == (method or "fast")
     assert retune_request(**request.asked()) == request == pickle.loads(pickle.dumps(request))
-    many = fleet_request(**named, pattern="TIC-*", verify=False, requested_by="me")
+    many = fleet_request(**named, pattern="TIC-*", verify=False, by="me")
     assert type(many) is fleet and many.each() == request
 
 
 def test_the_options_of_the_procedures_are_made_of_it() -> None:
     fast = retune_request(
-        ms=1.4, derivative=True, aim="load", amplitude_pct=5, careful=True, verify=False, propose_anyway=True
+        Ms=1.4, derivative=True, aim="load", amplitude_pct=5, min_switches=6, verify=False, propose_anyway=True
     )
     assert fast.options == FastOptions(
-        1.4, True, amplitude=5.0, careful=True, verify=False, propose_anyway=True, aim=Aim.LOAD
+        1.4, True, amplitude=5.0, min_switches=6, verify=False, propose_anyway=True, aim=Aim.LOAD
     )
     pulses = retune_request(method="setpoint", aim="no_overshoot")
     assert pulses.options == DesignOptions(aim=Aim.NO_OVERSHOOT)
@@ -119,10 +119,13 @@ def test_fast_designs_for_every_form() -> None:
         # an option that a method does not have, at its default and as null too, with those that it has
         ({"k_source": "k5"}, "k_source: of the five-stage experiment, not of fast, which is used unless"),
         ({"Ku": None}, "its options are sp_deviation, mv_low"),
-        ({"method": "fast", "method_options": {}}, "careful"),
-        ({"method": "five-stage", "ms": 1.6}, 'ms: of "method": "fast", not of five-stage; its options are'),
-        ({"method": "simc", "careful": False}, "method_options"),
+        ({"method": "fast", "method_options": {}}, "min_switches"),
+        ({"method": "five-stage", "Ms": 1.6}, 'Ms: of "method": "fast", not of five-stage; its options are'),
+        ({"method": "simc", "min_switches": 4}, "method_options"),
         ({"method": "simc", "pattern": "*"}, "pattern: no option of simc; its options are"),
+        ({"ms": 1.4}, "ms: no option of fast; did you mean Ms?; its options are"),
+        ({"careful": True}, "careful: no option of fast; did you mean min_switches?"),
+        ({"requested_by": "me"}, "requested_by: no option of fast; did you mean by?"),
         ({"ms_aim": 1.4}, "ms_aim: no option of fast; did you mean aim?; its options are"),
         # of the rule
         ({"method": "simc", "method_options": {"lambda_s": 1}}, "simc has no option 'lambda_s'; it has: controller"),

@@ -83,11 +83,11 @@ def test_the_audit_log_says_who_has_asked_and_at_which_gateway(fleet: TwoGateway
     finally:
         current.reset(token)
     row = next(row for row in audit.trail(fleet.there.store.engine, 10) if row.what == "accept")
-    assert (row.who, row.key_id, row.address, row.gateway) == ("control room", "0f3ac2d9be11", "10.0.0.7", HERE)
-    assert (row.said_by, row.loop) == ("A. Lind", TAG_THERE)
+    assert (row.key, row.key_id, row.address, row.gateway) == ("control room", "0f3ac2d9be11", "10.0.0.7", HERE)
+    assert (row.by, row.loop) == ("A. Lind", TAG_THERE)
     fleet.there.decide(job, "rollback")  # at home, over HTTP
     entries = fleet.here.http.get("/audit", params={"what": "rollback"}).json()
-    assert [(each["said_by"], each["gateway"]) for each in entries] == [("A. Lind", THERE)]
+    assert [(each["by"], each["gateway"]) for each in entries] == [("A. Lind", THERE)]
     decisions = fleet.here.http.get("/decisions", params={"loop": TAG_THERE}).json()
     assert [(each["what"], each["gateway"]) for each in decisions][:2] == [("rollback", THERE), ("accept", HERE)]
 

@@ -67,7 +67,12 @@ def alarms(service: Service) -> AlarmWatch:
 
 def test_the_job_says_what_the_loop_is_and_who_has_to_act(service: Service) -> None:
     job = ended(service)
-    assert (job.state, job.reason, job.false_pv, job.look_after) == (JobState.FAILED, Reason.PV_FROZEN, True, False)
+    assert (job.state, job.reason, job.false_pv, job.restore_unconfirmed) == (
+        JobState.FAILED,
+        Reason.PV_FROZEN,
+        True,
+        False,
+    )
     assert job.restored is not None and (job.restored["mode"], job.restored["manual_output"]) == ("manual", 40.0)
     assert "10 samples; PV is false: the loop was left in manual at MV 40" in (job.detail or "")
     assert "until an operator has mended the sensor and puts the loop in automatic" in (job.detail or "")
@@ -77,26 +82,26 @@ def test_the_job_says_what_the_loop_is_and_who_has_to_act(service: Service) -> N
 def test_no_test_begins_until_a_person_has_acknowledged_it(service: Service, client: TestClient) -> None:
     job = ended(service)
     assert f"job {job.id} found PV of loop {TAG} to be false" in refused(service)
-    assert f"loopwright dismiss {TAG}" in refused(service)
-    answer = client.post(f"/loops/{TAG}/retune", json={"requested_by": "A. Lind"})
+    assert f"loopwright acknowledge {TAG}" in refused(service)
+    answer = client.post(f"/loops/{TAG}/retune", json={"by": "A. Lind"})
     assert (answer.status_code, answer.json()["reason"]) == (409, "not_acknowledged")
-    assert f"loopwright dismiss {TAG}" in answer.json()["detail"] and job.id in answer.json()["detail"]
+    assert f"loopwright acknowledge {TAG}" in answer.json()["detail"] and job.id in answer.json()["detail"]
     preview = client.post(f"/loops/{TAG}/retune/preview", json={}).json()
     assert not preview["would_start"]
     assert "not_acknowledged" in [each["reason"] for each in preview["obstacles"]]
-    many = client.post("/retunes/preview", json={"loops": [TAG]}).json()
+    many = client.post("/batches/preview", json={"loops": [TAG]}).json()
     assert "not_acknowledged" in str(many)
     assert job.id in client.get(f"/loops/{TAG}").json()["not_acknowledged"]
     rehearsal = service.jobs.start(TAG, FastRetune(dry_run=True))
     service.wait(rehearsal.id)
     assert service.store.get(rehearsal.id).state is JobState.REHEARSED
 
-    assert client.post(f"/loops/{TAG}/dismiss", json={"by": "A. Lind"}).json()["jobs"] == [f"/jobs/{job.id}"]
+    assert client.post(f"/loops/{TAG}/acknowledge", json={"by": "A. Lind"}).json()["jobs"] == [f"/jobs/{job.id}"]
     assert client.get(f"/loops/{TAG}").json()["not_acknowledged"] is None
-    assert client.post(f"/loops/{TAG}/dismiss", json={"by": "A. Lind"}).json()["jobs"] == []
-    entries = audit.trail(service.store.engine, 10, what=["dismiss", "alarm_sign_off"])
-    assert {(entry.what, entry.loop, entry.said_by) for entry in entries} == {
-        ("dismiss", TAG, "A. Lind"), ("alarm_sign_off", TAG, "A. Lind"),
+    assert client.post(f"/loops/{TAG}/acknowledge", json={"by": "A. Lind"}).json()["jobs"] == []
+    entries = audit.trail(service.store.engine, 10, what=["acknowledge", "acknowledge_alarm"])
+    assert {(entry.what, entry.loop, entry.by) for entry in entries} == {
+        ("acknowledge", TAG, "A. Lind"), ("acknowledge_alarm", TAG, "A. Lind"),
     }  # fmt: skip
     service.controller.state = replace(service.controller.state, mode=Mode.AUTOMATIC)
     service.wait(service.jobs.start(TAG, FastRetune()).id)
@@ -106,9 +111,9 @@ def test_signing_its_alarm_off_is_acknowledging_it(service: Service) -> None:
     job = ended(service)
     watch = alarms(service)
     (alarm,) = watch.look()
-    assert (alarm.level, alarm.job, alarm.kind) == (1, f"/jobs/{job.id}", "false_pv")
+    assert (alarm.priority, alarm.job, alarm.kind) == (1, f"/jobs/{job.id}", "false_pv")
     assert "the loop was left in manual at MV 40 %" in alarm.text
-    watch.sign_off(alarm.id, "A. Lind")
+    watch.acknowledge(alarm.id, "A. Lind")
     assert watch.look() == ()
     service.wait(service.jobs.start(TAG, FastRetune()).id)
 
@@ -136,8 +141,8 @@ def test_a_job_that_waits_for_its_turn_is_refused(service: Service) -> None:
 
 def test_a_batch_leaves_the_loop_out_and_says_why(service: Service, client: TestClient) -> None:
     job = ended(service)
-    asked = {"loops": [TAG], "stop_after_failures": 1, "requested_by": "A. Lind"}
-    url = client.post("/retunes", json=asked).json()["url"]
+    asked = {"loops": [TAG], "stop_after_failures": 1, "by": "A. Lind"}
+    url = client.post("/batches", json=asked).json()["url"]
     until(lambda: client.get(url).json()["ended_at"] is not None, "the end of the batch")
     found = client.get(url).json()
     (part,) = found["loops"]
@@ -213,11 +218,11 @@ def test_a_loop_that_is_found_held_only_later_is_to_be_acknowledged_too(service:
     silent(service.controller)
     service.tune.hold.set()
     service.wait(job_id)
-    assert (service.store.get(job_id).look_after, service.store.get(job_id).false_pv) == (True, False)
+    assert (service.store.get(job_id).restore_unconfirmed, service.store.get(job_id).false_pv) == (True, False)
     service.controller.absent = None
     service.jobs.aftercare.check_due_loops()
     found = service.store.get(job_id)
-    assert (found.look_after, found.false_pv) == (False, True)
+    assert (found.restore_unconfirmed, found.false_pv) == (False, True)
     assert found.restored is not None and found.restored["mode"] == "manual"
     assert job_id in refused(service)
 
@@ -236,5 +241,5 @@ def test_a_test_that_is_asked_for_before_that_look_finds_it_out_itself(service: 
     found = service.store.get(later.id)
     assert (found.state, found.reason, found.session) == (JobState.REFUSED, Reason.NOT_ACKNOWLEDGED, None), found.detail
     earlier = service.store.get(job_id)
-    assert (earlier.look_after, earlier.false_pv) == (False, True)
+    assert (earlier.restore_unconfirmed, earlier.false_pv) == (False, True)
     assert service.controller.state.mode is Mode.MANUAL

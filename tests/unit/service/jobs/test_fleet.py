@@ -20,11 +20,11 @@ from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest, fleet_r
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.states.job_state import JobState
-from loopwright.service.store import audit, retunes
+from loopwright.service.store import audit, batches
+from loopwright.service.store.batches import BatchOver, NoSuchBatch, Part
 from loopwright.service.store.journal_writes import Write
-from loopwright.service.store.retunes import NoSuchRetune, Part, RetuneOver
 from loopwright.service.store.store import Store
-from loopwright.service.store.tables import RetuneRow
+from loopwright.service.store.tables import BatchRow
 from loopwright.tuning.reasons import Aborted, Failed, Reason, Refused
 from tests.unit.service.apps import app_of
 from tests.unit.service.fakes import (
@@ -79,11 +79,11 @@ class Plant(Service):
     def hold(self) -> None:
         self.tune.hold.clear()
 
-    def parts(self, retune_id: str) -> dict[str, Part]:
-        return {part.loop: part for part in self.fleet.get(retune_id)[1]}
+    def parts(self, batch_id: str) -> dict[str, Part]:
+        return {part.loop: part for part in self.fleet.get(batch_id)[1]}
 
-    def state(self, retune_id: str) -> str:
-        return self.fleet.get(retune_id)[0].state
+    def state(self, batch_id: str) -> str:
+        return self.fleet.get(batch_id)[0].state
 
 
 @pytest.fixture
@@ -197,10 +197,10 @@ def test_abort_stops_what_runs_and_begins_nothing_more(plant: Plant) -> None:
     row, parts = plant.fleet.get(retune)
     assert (row.state, row.stop_reason) == ("aborted", "operator")
     assert [part.state(False) for part in parts] == ["aborted", "aborted", "skipped"]
-    with pytest.raises(RetuneOver, match=r"ended at .* as aborted: nothing of it is left to stop"):
+    with pytest.raises(BatchOver, match=r"ended at .* as aborted: nothing of it is left to stop"):
         plant.fleet.abort(retune, "me")
-    what = [(row.what, row.said_by) for row in audit.trail(plant.store.engine, 10)]
-    assert ("retune_many_abort", "me") in what and ("retune_many", "service") in what
+    what = [(row.what, row.by) for row in audit.trail(plant.store.engine, 10)]
+    assert ("batch_abort", "me") in what and ("batch", "service") in what
 
 
 def test_a_retune_stopped_while_its_next_job_is_made_has_no_such_job(plant: Plant) -> None:
@@ -238,7 +238,7 @@ def test_a_service_killed_in_between_goes_on_with_the_same_jobs(tmp_path: Path) 
 def test_a_service_stopped_in_between_goes_on_where_it_was(tmp_path: Path) -> None:
     first = Plant(tmp_path)
     first.hold()
-    retune = first.fleet.start(asked(pattern="A-*", at_once_per_bus=1, sp_deviation=1.5, requested_by="night")).id
+    retune = first.fleet.start(asked(pattern="A-*", at_once_per_bus=1, sp_deviation=1.5, by="night")).id
     first.fleet.poll()
     (cut,) = first.store.unfinished()
     assert first.tune.inside.wait(60)
@@ -254,7 +254,7 @@ def test_a_service_stopped_in_between_goes_on_where_it_was(tmp_path: Path) -> No
     assert again.state(retune) == "done" and {p.job_state for p in parts.values()} == {JobState.PROPOSED}
     assert parts["A-1"].job_id != cut.id, "the loop whose job was cut short had another"
     jobs = again.store.recent()
-    assert len(jobs) == 4 and {(j.request["sp_deviation"], j.requested_by) for j in jobs} == {(1.5, "night")}
+    assert len(jobs) == 4 and {(j.request["sp_deviation"], j.by) for j in jobs} == {(1.5, "night")}
     again.close()
 
 
@@ -298,13 +298,13 @@ def test_a_loop_cut_short_and_gone_at_the_next_start_is_said_so_and_counts_as_fa
     plant, retune, cut = cut_short
     del plant.loops["A-1"]
     given_up: list[str] = []
-    give_up = retunes.give_up
+    give_up = batches.give_up
 
-    def counted(session: Session, retune_id: str, position: int, detail: str, reason: Reason | None = None) -> None:
+    def counted(session: Session, batch_id: str, position: int, detail: str, reason: Reason | None = None) -> None:
         given_up.append(detail)
-        give_up(session, retune_id, position, detail, reason)
+        give_up(session, batch_id, position, detail, reason)
 
-    monkeypatch.setattr(retunes, "give_up", counted)
+    monkeypatch.setattr(batches, "give_up", counted)
     for _ in range(3):
         plant.settle()
     part = plant.parts(retune)["A-1"]
@@ -312,10 +312,10 @@ def test_a_loop_cut_short_and_gone_at_the_next_start_is_said_so_and_counts_as_fa
     assert plant.state(retune) == "done" and given_up == ["there is no loop A-1"]
 
 
-def of_another_version(plant: Plant, retune_id: str) -> None:
+def of_another_version(plant: Plant, batch_id: str) -> None:
     """The stored request has an option that this version does not know."""
     with plant.store.writing() as session:
-        row = retunes.find(session, retune_id)
+        row = batches.find(session, batch_id)
         row.request = {**row.request, "renamed_since": 1}
 
 
@@ -356,14 +356,14 @@ def test_a_defect_in_one_retune_does_not_hold_up_the_others(
     plant.hold()
     begin = plant.fleet.begin
 
-    def defective(row: RetuneRow, request: FleetRequest, parts: list[Part]) -> None:
+    def defective(row: BatchRow, request: FleetRequest, parts: list[Part]) -> None:
         if row.id == first:
             raise KeyError("A-1")
         begin(row, request, parts)
 
     monkeypatch.setattr(plant.fleet, "begin", defective)
     plant.fleet.poll()
-    assert plant.running() == ["B-1"] and f"a defect in the retune of many loops {first}" in caplog.text
+    assert plant.running() == ["B-1"] and f"a defect in the batch {first}" in caplog.text
 
 
 def test_a_service_that_is_not_to_resume_ends_it(tmp_path: Path) -> None:
@@ -477,20 +477,20 @@ def until_over(client: TestClient, url: str) -> dict[str, Any]:
 
 
 def test_a_retune_of_many_over_http(plant: Plant, client: TestClient) -> None:
-    answer = client.post("/retunes", json={"pattern": "A-*", "at_once_per_bus": 2, "requested_by": "night shift"})
+    answer = client.post("/batches", json={"pattern": "A-*", "at_once_per_bus": 2, "by": "night shift"})
     assert answer.status_code == 202 and answer.headers["location"] == answer.json()["url"]
     body = until_over(client, answer.headers["location"])
     assert body["state"] == "done" and body["counts"] == {"proposed": 3} and body["failures"] == 0
-    assert body["request"]["at_once_per_bus"] == 2 and body["requested_by"] == "night shift"
+    assert body["request"]["at_once_per_bus"] == 2 and body["by"] == "night shift"
     for part in body["loops"]:
         job = client.get(part["job"]).json()
         assert (job["loop"], job["state"]) == (part["loop"], part["state"]) == (part["loop"], "proposed")
     assert client.post(f"{body['url']}/abort").status_code == 409
-    assert client.get("/retunes/none").status_code == 404
-    assert client.post("/retunes/none/abort").status_code == 404
-    refused = client.post("/retunes", json={"requested_by": "me", "loops": ["Z"]})
+    assert client.get("/batches/none").status_code == 404
+    assert client.post("/batches/none/abort").status_code == 404
+    refused = client.post("/batches", json={"by": "me", "loops": ["Z"]})
     assert refused.status_code == 422 and refused.json()["reason"] == "bad_input"
-    assert [one["id"] for one in client.get("/retunes").json()] == [body["id"]]
+    assert [one["id"] for one in client.get("/batches").json()] == [body["id"]]
 
 
 def test_loops_by_state(plant: Plant, client: TestClient) -> None:
@@ -556,7 +556,7 @@ def test_the_command_line_gets_the_whole_list(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_unknown(plant: Plant) -> None:
-    with pytest.raises(NoSuchRetune):
+    with pytest.raises(NoSuchBatch):
         plant.fleet.get("none")
 
 
@@ -601,16 +601,16 @@ def test_an_abort_that_the_database_does_not_take_is_heard_at_once_and_kept(
     until(lambda: len(plant.jobs.registry.running) == 3)
     with monkeypatch.context() as patch:
         patch.setattr(plant.store, "writing", away)
-        assert client.post(f"/retunes/{retune}/abort", json={"by": "operator A"}).status_code == 202
-        assert client.post(f"/retunes/{retune}/abort", json={"by": "operator A"}).status_code == 202
+        assert client.post(f"/batches/{retune}/abort", json={"by": "operator A"}).status_code == 202
+        assert client.post(f"/batches/{retune}/abort", json={"by": "operator A"}).status_code == 202
         assert sorted(map(str, reasons(plant))) == ["None", "operator", "operator"]
     assert plant.jobs.journal.flush(PATIENCE_S)
     until(lambda: plant.running() == ["B-Y1"])
     until(lambda: plant.state(retune) == "aborted")
     parts = plant.parts(retune)
     assert [parts[f"A-{n}"].job_state for n in (1, 2, 3)] == [JobState.ABORTED, JobState.ABORTED, None]
-    trail = [(row.what, row.said_by) for row in audit.trail(plant.store.engine, 100) if "abort" in row.what]
-    assert sorted(trail) == [("abort", f"retune {retune}")] * 2 + [("retune_many_abort", "operator A")]
+    trail = [(row.what, row.by) for row in audit.trail(plant.store.engine, 100) if "abort" in row.what]
+    assert sorted(trail) == [("abort", f"batch {retune}")] * 2 + [("batch_abort", "operator A")]
 
 
 def test_no_more_loops_are_begun_while_an_abort_waits_for_the_database(
@@ -646,8 +646,8 @@ def test_an_abort_while_the_database_answers_nothing_says_that_the_tests_have_he
     with monkeypatch.context() as patch:
         patch.setattr(plant.store, "writing", away)
         patch.setattr(plant.store, "reading", away)
-        answer = client.post(f"/retunes/{retune}/abort")
-        assert answer.status_code == 503 and "the 2 tests of retune" in answer.json()["detail"]
+        answer = client.post(f"/batches/{retune}/abort")
+        assert answer.status_code == 503 and "the 2 tests of batch" in answer.json()["detail"]
         assert reasons(plant) == [Reason.OPERATOR] * 2
     assert plant.jobs.journal.flush(PATIENCE_S)
     until(lambda: plant.state(retune) == "aborted")
@@ -662,6 +662,6 @@ def test_an_abort_of_a_retune_of_which_nothing_runs_is_refused_where_the_databas
     retune = plant.fleet.start(asked(loops=["A-1"])).id
     with monkeypatch.context() as patch:
         patch.setattr(plant.store, "writing", away)
-        assert client.post(f"/retunes/{retune}/abort").status_code == 503
+        assert client.post(f"/batches/{retune}/abort").status_code == 503
     assert reasons(plant) == [None]
-    assert client.post(f"/retunes/{retune}/abort").status_code == 202
+    assert client.post(f"/batches/{retune}/abort").status_code == 202

@@ -156,7 +156,7 @@ def test_a_real_rehearsal_through_a_job(service: Service, method: str) -> None:
     K, T, L = 0.2, 2.4, 1.8
     if method == "five-stage":
         assert isinstance(view.model, ModelView) and view.model.T_s > 0
-        assert view.before and view.after and view.after.settled
+        assert view.step_before and view.step_after and view.step_after.settled
         return
     model = view.model
     assert isinstance(model, TransferModelView) and model.num_errors is not None
@@ -164,16 +164,16 @@ def test_a_real_rehearsal_through_a_job(service: Service, method: str) -> None:
     assert model.den[0] / model.den[-1] == pytest.approx(T, rel=1e-3)
     assert model.dead_time_s == pytest.approx(L, rel=1e-3)
     assert view.predicted.Ms == pytest.approx(1.6, abs=0.01)
-    assert view.predicted_before and view.evidence and view.verification
+    assert view.predicted_previous and view.evidence and view.verification
     assert view.evidence.reason is None and view.evidence.switches >= 4
     assert view.verification.fit_pct > 99.9 and view.verification.Ms == pytest.approx(1.6, abs=0.05)
-    assert view.before is None and view.after is None
-    assert "overshoot_window_pct" not in row.request and row.request["ms"] == 1.6
+    assert view.step_before is None and view.step_after is None
+    assert "overshoot_window_pct" not in row.request and row.request["Ms"] == 1.6
 
 
 def test_samples_of_a_rehearsal_are_kept(service: Service) -> None:
     jobs = service.more_jobs(lambda config: FakeLoop(service.controller), rehearse)
-    row = jobs.start(TAG, retune_request(dry_run=True, ms=1.4))
+    row = jobs.start(TAG, retune_request(dry_run=True, Ms=1.4))
     service.wait(row.id)
     jobs.stop()
     stages = [stage for stage, _ in service.store.samples(row.id)]
@@ -213,8 +213,8 @@ def test_an_abort_that_the_database_does_not_take_is_written_once_when_it_does(
     assert service.jobs.journal.flush(60)
     row, (told,) = service.store.get(job_id), aborts(service)
     assert (row.state, row.reason, row.stop_reason) == ("aborted", Reason.OPERATOR, Reason.OPERATOR)
-    assert (told.who, told.key_id, told.address) == (who.name, who.key_id, who.address)
-    assert (told.said_by, told.before, told.loop) == ("operator A", {"state": "running"}, TAG)
+    assert (told.key, told.key_id, told.address) == (who.name, who.key_id, who.address)
+    assert (told.by, told.before, told.loop) == ("operator A", {"state": "running"}, TAG)
     (event,) = [each for each in service.store.events(job_id) if each.kind == "abort_requested"]
     assert event.data == {"by": "operator A"} and event.at <= asked and told.at <= asked
 
@@ -234,7 +234,7 @@ def test_who_aborted_is_written_also_after_the_jobs_own_end(service: Service, mo
         service.jobs.journal.put(write)
     assert service.jobs.journal.flush(60)
     (told,) = aborts(service)
-    assert (told.said_by, told.before) == ("me", {"state": "running"})
+    assert (told.by, told.before) == ("me", {"state": "running"})
 
 
 def test_a_job_that_came_to_its_own_end_has_no_abort_written_later(
@@ -271,7 +271,7 @@ def test_an_abort_while_the_database_answers_nothing_says_that_the_job_has_heard
     assert f"job {job_id} has been told to stop" in detail and answer.headers["retry-after"]
     service.wait(job_id)
     assert service.jobs.journal.flush(60)
-    assert [each.said_by for each in aborts(service)] == ["me"]
+    assert [each.by for each in aborts(service)] == ["me"]
 
 
 def test_an_abort_that_waits_for_the_database_is_accepted_and_shown_later(
@@ -303,6 +303,6 @@ def test_a_job_that_ends_for_an_abort_before_it_is_written_down_was_aborted_by_i
     monkeypatch.setattr(service.store, "request_stop", slow)
     assert service.jobs.abort(row.id, "me").state == "aborted"
     (told,) = aborts(service)
-    assert (told.subject, told.said_by) == (row.id, "me")
+    assert (told.subject, told.by) == (row.id, "me")
     with pytest.raises(IllegalMove):
         service.jobs.abort(row.id, "me")

@@ -50,7 +50,7 @@ MAX_ATTEMPTS = 10
 WHICH = st.integers(0, 15)
 OPTIONS: tuple[dict[str, Any], ...] = (
     {},
-    {"ms": 1.4, "derivative": True, "aim": "no_overshoot", "amplitude_pct": 10.0, "careful": True, "verify": False},
+    {"Ms": 1.4, "derivative": True, "aim": "no_overshoot", "amplitude_pct": 10.0, "min_switches": 6, "verify": False},
     {"settling_s": 300.0, "mv_peak": 4.0, "noise_gain": 2.0},
     {"start": "design", "model": {"num": [1.0], "den": [3.0, 1.0], "dead_time_s": 1.0}},
     {"method": "five-stage", "overshoot_window_pct": (8.0, 50.0), "baseline": False},
@@ -190,14 +190,14 @@ class JobsMachine(RuleBasedStateMachine):
         return FakeLoop(self.controllers[config.tag])
 
     def tune(self, config: LoopConfig, request: RetuneRequest, loop: Loop, state: LoopState, hooks: Hooks) -> Outcome:
-        act = self.acts[request.requested_by]
+        act = self.acts[request.by]
         hooks.on_home(loop.begin(hooks.stop, hooks.note_session))
         loop.step((SetGains(act.new),))
         result, ended = act.play(hooks)
         return Outcome(result, ended, loop.restore(state).state, {})
 
     def rehearse(self, config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcome:
-        result, ended = self.acts[request.requested_by].play(hooks)
+        result, ended = self.acts[request.by].play(hooks)
         return Outcome(result, ended, None, {})
 
     # helpers
@@ -226,7 +226,7 @@ class JobsMachine(RuleBasedStateMachine):
         n = len(self.acts)
         name = f"wish {n}"
         self.acts[name] = act = Act(Gains(0.6 + 0.01 * n, 3.0))
-        request = retune_request(requested_by=name, dry_run=dry, **options)
+        request = retune_request(by=name, dry_run=dry, **options)
         other = None if dry else self.having(loop)
         if loop in self.locked and not dry:
             with pytest.raises(Locked):

@@ -26,15 +26,15 @@ EVIDENCE = EvidenceView(
 FOUND = FastResult(
     method="fast",
     model=model(),
-    old_gains=GainsView.of(OLD),
+    previous_gains=GainsView.of(OLD),
     new_gains=GainsView.of(NEW),
     evidence=EVIDENCE,
-    known_before=KnownMsView(Ms=2.1, uncertainty=0.08),
+    known_previous=KnownMsView(Ms=2.1, uncertainty=0.08),
 )
 TRIAL = FastResult(
     method="fast",
     model=model().model_copy(update={"structure": TYPED_IN}),
-    old_gains=GainsView.of(OLD),
+    previous_gains=GainsView.of(OLD),
     new_gains=GainsView.of(NEW),
 )
 

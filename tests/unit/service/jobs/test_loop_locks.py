@@ -64,7 +64,7 @@ def locked(client: TestClient, reason: str = WHY, by: str = "night shift", tag: 
 def entries(service: Service) -> list[tuple[str, str, str | None]]:
     """Locks and unlocks in the audit log, the first one first."""
     found = audit.trail(service.store.engine, 100, loop=TAG)
-    return [(row.what, row.subject, row.said_by) for row in reversed(found) if "lock" in row.what]
+    return [(row.what, row.subject, row.by) for row in reversed(found) if "lock" in row.what]
 
 
 def test_locked_and_unlocked(service: Service, client: TestClient) -> None:
@@ -106,16 +106,16 @@ def test_a_loop_that_is_not_there(service: Service, client: TestClient) -> None:
 
 def test_no_test_begins_but_a_rehearsal_may(service: Service, client: TestClient) -> None:
     locked(client)
-    problem = assert_problem(client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}), 409)
+    problem = assert_problem(client.post(f"/loops/{TAG}/retune", json={"by": "me"}), 409)
     assert problem["reason"] == "locked" and "loopwright unlock" in problem["advice"] and WHY in problem["detail"]
     assert service.store.recent() == []
-    assert client.post("/loops/FIC-2/retune", json={"requested_by": "me"}).status_code == 202
+    assert client.post("/loops/FIC-2/retune", json={"by": "me"}).status_code == 202
     job = client.post(f"/loops/{TAG}/retune", json={"dry_run": True})
     assert job.status_code == 202
     service.wait(job.json()["id"])
     assert service.store.get(job.json()["id"]).state == "rehearsed"
     client.post(f"/loops/{TAG}/unlock")
-    assert client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).status_code == 202
+    assert client.post(f"/loops/{TAG}/retune", json={"by": "me"}).status_code == 202
 
 
 def test_no_decision_writes_to_it(service: Service, client: TestClient) -> None:
@@ -172,7 +172,7 @@ def test_a_lock_waits_for_a_decision_that_writes(service: Service) -> None:
 
 def test_a_running_test_goes_on_and_the_answer_says_how_to_end_it(service: Service, client: TestClient) -> None:
     service.tune.hold.clear()
-    job = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()["id"]
+    job = client.post(f"/loops/{TAG}/retune", json={"by": "me"}).json()["id"]
     assert service.tune.inside.wait(10)
     answer = locked(client).json()
     assert answer["running_job"] == f"/jobs/{job}" and f"loopwright job {job} --abort" in answer["note"]
@@ -183,7 +183,7 @@ def test_a_running_test_goes_on_and_the_answer_says_how_to_end_it(service: Servi
 
 def test_a_running_test_may_be_aborted_and_the_loop_is_made_safe(service: Service, client: TestClient) -> None:
     service.tune.hold.clear()
-    job = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()["id"]
+    job = client.post(f"/loops/{TAG}/retune", json={"by": "me"}).json()["id"]
     assert service.tune.inside.wait(10)
     locked(client)
     assert client.post(f"/jobs/{job}/abort").status_code == 202
@@ -200,13 +200,15 @@ def test_a_job_that_waited_is_refused_at_its_turn(tmp_path: Path) -> None:
     engine.begin(job)
     service.wait(job)
     row = service.store.get(job)
-    assert (row.state, row.reason) == ("refused", "locked") and WHY in (row.detail or "") and not row.look_after
+    assert (
+        (row.state, row.reason) == ("refused", "locked") and WHY in (row.detail or "") and not row.restore_unconfirmed
+    )
     assert not service.tune.inside.is_set() and service.controller.session_last == 0
     service.close()
 
 
 def test_killed_during_its_test_a_locked_loop_is_made_safe_and_not_tested_again(tmp_path: Path) -> None:
-    """Safety first: the session is closed all the same, and a loop that is not reached is looked after until it is."""
+    """Safety first: the session is closed all the same, and a loop that is not reached is monitored until it is."""
     first = Service(tmp_path, engine=Deaf())
     rows = {}
     for tag in first.loops:
@@ -214,7 +216,7 @@ def test_killed_during_its_test_a_locked_loop_is_made_safe_and_not_tested_again(
     first.jobs.stop_watching()
     state = state_json(first.controller.state)
     for job in rows.values():
-        first.store.move(job, JobState.RUNNING, attempt=1, found=state, old_gains=state["gains"], session=7)
+        first.store.move(job, JobState.RUNNING, attempt=1, found=state, previous_gains=state["gains"], session=7)
     first.jobs.locking.lock(TAG, WHY, "me")
     controller = first.controller
     controller.begin_session(7)
@@ -237,17 +239,17 @@ def test_a_locked_loop_is_looked_after(service: Service, client: TestClient) -> 
     """What a job could not bring home is brought home, lock or not; and a person may answer for it."""
     job = service.jobs.start(TAG, FastRetune())
     service.wait(job.id)
-    service.store.note(job.id, look_after=True)
+    service.store.note(job.id, restore_unconfirmed=True)
     locked(client)
     service.jobs.aftercare.check_due_loops()
-    assert not service.store.get(job.id).look_after
-    service.store.note(job.id, look_after=True)
-    assert client.post(f"/loops/{TAG}/dismiss").json()["jobs"] == [f"/jobs/{job.id}"]
+    assert not service.store.get(job.id).restore_unconfirmed
+    service.store.note(job.id, restore_unconfirmed=True)
+    assert client.post(f"/loops/{TAG}/acknowledge").json()["jobs"] == [f"/jobs/{job.id}"]
 
 
 def test_a_retune_of_many_skips_it_and_says_so(service: Service, client: TestClient) -> None:
     locked(client)
-    url = client.post("/retunes", json={"requested_by": "me", "pattern": "*", "stop_after_failures": 1}).json()["url"]
+    url = client.post("/batches", json={"by": "me", "pattern": "*", "stop_after_failures": 1}).json()["url"]
     for _ in range(5000):
         found = client.get(url).json()
         if found["ended_at"]:
@@ -446,4 +448,4 @@ def test_who_may_only_look_may_not_lock(service: Service) -> None:
         for path in ("lock", "unlock"):
             answer = client.post(f"/loops/{TAG}/{path}", json={"reason": WHY}, headers=headers)
             assert answer.status_code == status, answer.text
-    assert [row.who for row in audit.trail(service.store.engine, 2)] == ["operate", "operate"]
+    assert [row.key for row in audit.trail(service.store.engine, 2)] == ["operate", "operate"]

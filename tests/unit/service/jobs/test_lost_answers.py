@@ -85,14 +85,14 @@ def test_a_retune_that_was_answered_with_503_does_not_begin_by_itself(
     service: Service, client: TestClient, answers: LosesAnswers
 ) -> None:
     answers.lose_next()
-    assert_problem(client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}), 503)
+    assert_problem(client.post(f"/loops/{TAG}/retune", json={"by": "me"}), 503)
     assert answers.lost
     for _ in range(3):
         service.jobs.reconcile()
     (row,) = service.store.recent()
     assert (row.state, row.reason, row.detail) == ("failed", "internal", "it could not be queued")
     assert not service.tune.inside.is_set() and not service.jobs.registry.unqueued
-    again = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"})
+    again = client.post(f"/loops/{TAG}/retune", json={"by": "me"})
     assert again.status_code == 202
     service.wait(again.json()["id"])
     assert service.store.get(again.json()["id"]).state == "proposed"

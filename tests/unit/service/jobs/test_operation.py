@@ -108,7 +108,7 @@ def test_what_a_trial_has_disproved_is_dropped_and_its_history_not_used_again(se
     why = "the step shows another plant than operation did: the gain would be 2 +- 0.1 times that of operation"
     here.operation.outdated(here.job, [trial(why)])
     found = knowledge.read(service.store, TAG)
-    assert [each.older_plant for each in found] == [f"job {here.job.id} has tried gains from operation, and {why}"]
+    assert [each.superseded for each in found] == [f"job {here.job.id} has tried gains from operation, and {why}"]
     assert job_knowledge.outdated_until_s(service.store, TAG) == pytest.approx(here.now_s, abs=0.01)
     assert job_knowledge.outdated_until_s(service.store, "FIC-2") is None
     assert isinstance(here.known(here.new_job()), NothingKnown)
@@ -124,5 +124,5 @@ def test_a_trial_that_confirms_drops_nothing(service: Service) -> None:
     for events in ([], [trial(None)], [trial("another plant"), trial(None)]):
         assert outdated_by(events) is None
         here.operation.outdated(here.job, events)
-    assert [each.older_plant for each in knowledge.read(service.store, TAG)] == [None]
+    assert [each.superseded for each in knowledge.read(service.store, TAG)] == [None]
     assert job_knowledge.outdated_until_s(service.store, TAG) is None

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import inspect, text
 from sqlalchemy.exc import OperationalError
 
 from loopwright.service.inputs.config import parse_site
@@ -37,7 +35,6 @@ from tests.unit.service.fakes import (
     fake_rehearse,
     loop_entry,
 )
-from tests.unit.service.store.test_store import migrate
 
 HOME = FakeController().state
 ON_TRIAL = replace(HOME, gains=NEW, on_trial=True, sp=52.0)
@@ -57,7 +54,7 @@ def left(folder: Path, version: str = WORKFLOW_VERSION, done: tuple[str, ...] = 
     store = Store(folder)
     row = store.create(TAG, {}, "me", False, version=version)
     old = {"Kp": OLD.Kp, "Ti": OLD.Ti}
-    running: dict[str, Any] = {"old_gains": old, "found": state_json(HOME), "attempt": 1, "session": SESSION}
+    running: dict[str, Any] = {"previous_gains": old, "found": state_json(HOME), "attempt": 1, "session": SESSION}
     store.move(row.id, JobState.RUNNING, **running | columns)
     for stage in done:
         store.append(row.id, "stage_started", {"stage": stage, "expected_s": 1.0, "remaining_s": 1.0}, 5.0)
@@ -185,7 +182,7 @@ def test_what_somebody_changed_meanwhile_stays_and_the_job_does_not_go_on(
     job_id = left(tmp_path)
     service = again(started, tmp_path, becomes)
     row = service.store.get(job_id)
-    assert (row.state, row.reason, row.look_after) == ("interrupted", reason.value, False)
+    assert (row.state, row.reason, row.restore_unconfirmed) == ("interrupted", reason.value, False)
     assert words in (row.detail or "") and "not as before the job" in (row.detail or "")
     assert service.controller.state == found and row.restored == state_json(found)
 
@@ -215,58 +212,8 @@ def test_a_loop_that_is_not_reached_is_said_so(started: list[Service], tmp_path:
     job_id = left(tmp_path)
     service = again(started, tmp_path, away(Reason.NODE_LOST))
     row = service.store.get(job_id)
-    assert (row.state, row.reason, row.restored, row.look_after) == ("interrupted", "node_lost", None, True)
+    assert (row.state, row.reason, row.restored, row.restore_unconfirmed) == ("interrupted", "node_lost", None, True)
     assert "not reached" in (row.detail or "")
-
-
-def older(folder: Path) -> str:
-    """A job in the middle of its test, in a database that the code before the sessions has left."""
-    store = Store(folder)
-    with store.engine.begin() as connection:
-        migrate(connection, "0004")
-        assert "session" not in {column["name"] for column in inspect(connection).get_columns("jobs")}
-        home = json.dumps({name: value for name, value in state_json(HOME).items() if name not in NEW_FIELDS})
-        connection.execute(
-            text(
-                "INSERT INTO jobs (id, loop, state, dry_run, request, requested_by, created_at, plant_time_s, host,"
-                " version, attempt, found) VALUES ('old', :tag, 'running', :no, '{}', 'me', '2026-01-01', 5.0, 'local',"
-                " '1', 1, :home)"
-            ),
-            {"tag": TAG, "no": False, "home": home},
-        )
-    store.close()
-    return "old"
-
-
-NEW_FIELDS = ("manual_output", "node_state", "when_silent")
-
-
-def test_a_job_of_the_code_before_ends_with_its_loop_read_back(started: list[Service], tmp_path: Path) -> None:
-    job_id = older(tmp_path)
-    service = again(started, tmp_path, restarted(HOME))
-    row = service.store.get(job_id)
-    assert (row.state, row.reason, row.look_after) == ("interrupted", "service_stopped", False)
-    assert "begun by another version of Loopwright" in (row.detail or "")
-    assert row.restored == state_json(HOME) and len(texts(service, job_id, "loop_found")) == 1
-    assert not service.tune.inside.is_set()
-
-
-def test_what_a_job_of_the_code_before_has_left_is_told_and_blamed_on_nobody(
-    started: list[Service], tmp_path: Path
-) -> None:
-    job_id = older(tmp_path)
-    service = again(started, tmp_path, restarted(replace(HOME, sp=52.0)))
-    row = service.store.get(job_id)
-    assert row.state == "interrupted" and row.restored is not None and row.restored["sp"] == 52.0
-    (found,) = texts(service, job_id, "loop_found")
-    assert "not as before the job, left so: set-point is 52, was 50" in found and "somebody" not in found
-
-
-def test_the_loop_of_a_job_of_the_code_before_is_looked_after_too(started: list[Service], tmp_path: Path) -> None:
-    job_id = older(tmp_path)
-    service = again(started, tmp_path, away(Reason.NODE_LOST))
-    row = service.store.get(job_id)
-    assert (row.state, row.session, row.look_after) == ("interrupted", None, True)
 
 
 def test_a_job_asked_to_stop_before_the_crash_is_stopped(started: list[Service], tmp_path: Path) -> None:
@@ -498,4 +445,4 @@ def test_no_loop_is_read_while_a_decision_is_carried_out(service: Service) -> No
     service.jobs.directory.open_loop = lambda config: Slow(service.controller)
     service.jobs.decisions.accept(first.id, "me")
     service.wait(seen[0])
-    assert service.store.get(seen[0]).old_gains == asdict(HOME.gains) | {"Kp": NEW.Kp, "Ti": NEW.Ti}
+    assert service.store.get(seen[0]).previous_gains == asdict(HOME.gains) | {"Kp": NEW.Kp, "Ti": NEW.Ti}

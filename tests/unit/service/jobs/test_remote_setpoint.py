@@ -41,7 +41,7 @@ def service(tmp_path: Path) -> Iterator[Service]:
 
 
 def test_it_is_refused_in_words_that_name_the_outer_loop(service: Service, client: TestClient) -> None:
-    answer = client.post(f"/loops/{INNER}/retune", json=PULSED | {"requested_by": "me"})
+    answer = client.post(f"/loops/{INNER}/retune", json=PULSED | {"by": "me"})
     assert (answer.status_code, answer.json()["reason"]) == (409, "setpoint_is_driven")
     for words in (f"comes from {TAG}", "to local set-point", "setpoint_from: operator", f"{TAG} in manual"):
         assert words in answer.json()["detail"]
@@ -49,7 +49,7 @@ def test_it_is_refused_in_words_that_name_the_outer_loop(service: Service, clien
     (obstacle,) = client.post(f"/loops/{INNER}/retune/preview", json=PULSED).json()["obstacles"]
     assert (obstacle["reason"], obstacle["detail"]) == ("setpoint_is_driven", answer.json()["detail"])
     service.loops[INNER] = remote(outer=None)
-    refused = client.post(f"/loops/{INNER}/retune", json=PULSED | {"requested_by": "me"})
+    refused = client.post(f"/loops/{INNER}/retune", json=PULSED | {"by": "me"})
     assert "comes from another controller" in refused.json()["detail"]
 
 
@@ -60,7 +60,7 @@ def test_it_is_refused_in_words_that_name_the_outer_loop(service: Service, clien
 def test_what_does_not_pulse_it_is_taken(
     service: Service, client: TestClient, tag: str, options: dict[str, Any]
 ) -> None:
-    assert client.post(f"/loops/{tag}/retune", json=options | {"requested_by": "me"}).status_code == 202
+    assert client.post(f"/loops/{tag}/retune", json=options | {"by": "me"}).status_code == 202
     assert "setpoint_is_driven" not in str(client.post(f"/loops/{tag}/retune/preview", json=options).json())
 
 

@@ -77,7 +77,7 @@ def test_what_is_deleted_is_written_down_and_the_rest_of_the_job_stays(store: St
     ids = [job(store, "A", R, X) for _ in range(121)]
     assert delete_old_samples(store, RetentionPolicy(jobs=1)) == 120, "in several transactions"
     rows = [row for row in audit.trail(store.engine, 1000) if row.what == "samples_delete"]
-    told = [(row.who, row.before, row.after) for row in reversed(rows)]
+    told = [(row.key, row.before, row.after) for row in reversed(rows)]
     assert [before and (len(before["jobs"]), before["samples"]) for _, before, _ in told] == [
         (50, 500), (50, 500), (20, 200),
     ]  # fmt: skip

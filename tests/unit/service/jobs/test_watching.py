@@ -1,4 +1,5 @@
-"""A loop is watched after gains were accepted: what operation shows of the model, and when the old gains come back."""
+"""A loop is watched after gains were accepted: what operation shows of the model, and when the previous gains come
+back."""
 
 from __future__ import annotations
 
@@ -57,15 +58,15 @@ def test_a_model_is_confirmed_by_three_changes(service: Service, client: TestCli
     here = WatchedLoop(service)
     here.accept()
     here.goes_on(2.0)
-    assert here.watch.end is None and "Nothing has moved the loop yet" in here.watch.words
+    assert here.watch.end is None and "Nothing has moved the loop yet" in here.watch.message
     three_changes(here)
     watch = here.watch
     assert (watch.conclusion().state, watch.conclusion().confirmed) == (ModelState.CONFIRMED, 3)
-    assert watch.words == "The model is confirmed by 3 changes of normal operation."
+    assert watch.message == "The model is confirmed by 3 changes of normal operation."
     assert watch.end is WatchEnd.COMPLETE and service.controller.state.gains == NEW
-    shown = client.get(f"/jobs/{here.job_id}").json()["watch"]
+    shown = client.get(f"/jobs/{here.job_id}").json()["monitoring"]
     assert (shown["verdict"], shown["confirmed"], shown["action"]) == ("confirmed", 3, None)
-    assert client.get(f"/loops/{TAG}").json()["watch"] == shown
+    assert client.get(f"/loops/{TAG}").json()["monitoring"] == shown
     alarms(client)
 
 
@@ -78,14 +79,14 @@ def test_a_second_path_that_the_record_could_not_show_is_found_and_rolled_back(
     found = here.watch.conclusion()
     assert found.state is ModelState.MISMATCH and found.instead is not None
     assert abs(found.instead.size - 0.43) < 0.05 and abs(found.instead.delay_s - 4.0 * PU) < 0.3 * PU
-    shown = client.get(f"/jobs/{here.job_id}").json()["watch"]
+    shown = client.get(f"/jobs/{here.job_id}").json()["monitoring"]
     assert (shown["verdict"], shown["instead"]["kind"], shown["action"]) == ("mismatch", "second_path", "rollback")
-    assert "a second path acts" in shown["words"]
+    assert "a second path acts" in shown["message"]
     (alarm,) = alarms(client, "model_mismatch")
     assert alarm["job"] == f"/jobs/{here.job_id}"
     assert "a second path acts" in alarm["text"] and "Roll the new gains back" in alarm["advice"]
     answer = client.post(f"/jobs/{here.job_id}/rollback", json={"by": "operator B"}).json()
-    assert (answer["watch"]["end"], answer["watch"]["action"]) == ("rolled_back", None)
+    assert (answer["monitoring"]["end"], answer["monitoring"]["action"]) == ("rolled_back", None)
     assert service.controller.state.gains == OLD
     alarms(client)
 
@@ -95,14 +96,14 @@ def test_a_loop_that_becomes_unstable_gets_its_old_gains_back(service: Service, 
     here.accept()
     here.goes_on(20.0, 1.0)
     trouble = here.watch.trouble
-    assert trouble is not None and trouble.put_back is True
+    assert trouble is not None and trouble.rolled_back is True
     assert trouble.kind is TroubleKind.GROWING_OSCILLATION and "PV oscillates under the new gains" in trouble.text
     assert service.controller.state.gains == OLD and here.watch.end is WatchEnd.ROLLED_BACK
     last = audit.trail(service.store.engine, 1)[0]
-    assert (last.what, last.said_by, last.who) == ("rollback", "watch after acceptance", "service")
+    assert (last.what, last.by, last.key) == ("rollback", "watch after acceptance", "service")
     (alarm,) = alarms(client, "rolled_back")
-    assert alarm["to_sign"] and "put back by the watch" in alarm["text"]
-    client.post(f"/alarms/{alarm['id']}/sign-off", json={"by": "operator B"})
+    assert alarm["unacknowledged"] and "put back by the watch" in alarm["text"]
+    client.post(f"/alarms/{alarm['id']}/acknowledge", json={"by": "operator B"})
     alarms(client)
     here.goes_on(3.0)
     assert service.store.get(here.job_id).state is JobState.ROLLED_BACK
@@ -121,7 +122,7 @@ def test_the_old_gains_come_back_whatever_the_clock_is_set_to(by_s: float, resta
     here.clock_is_set(by_s)
     here.goes_on(20.0, 1.0)
     trouble = here.watch.trouble
-    assert trouble is not None and (trouble.kind, trouble.put_back) == (TroubleKind.GROWING_OSCILLATION, True)
+    assert trouble is not None and (trouble.kind, trouble.rolled_back) == (TroubleKind.GROWING_OSCILLATION, True)
     assert service.controller.state.gains == OLD and here.watch.end is WatchEnd.ROLLED_BACK
 
 
@@ -138,7 +139,7 @@ def test_a_clock_that_jumps_does_not_shorten_the_time_for_which_pv_is_outside(se
     here.clock_is_set(-3600.0)
     here.steps(30)
     here.watching.look()
-    assert here.watch.trouble is not None and here.watch.trouble.put_back
+    assert here.watch.trouble is not None and here.watch.trouble.rolled_back
 
 
 def test_gains_that_were_read_before_the_acceptance_by_a_clock_that_was_ahead_are_not_of_others(
@@ -165,7 +166,7 @@ def test_a_loop_that_leaves_automatic_as_the_clock_is_set_back_has_left_it(set_a
     here.goes_on(0.5 - set_after)
     service.controller.by_hand(mode=Mode.AUTOMATIC)
     here.goes_on(5.0)
-    assert "the mode was changed at" in str(here.watch.disarmed) and not here.watch.armed
+    assert "the mode was changed at" in str(here.watch.auto_rollback_off) and not here.watch.armed
 
 
 def test_changes_are_compared_once_whatever_the_clock_is_set_to(service: Service) -> None:
@@ -226,7 +227,7 @@ def test_pv_that_leaves_its_limits_is_a_reason_too(service: Service) -> None:
     trouble = here.watch.trouble
     assert trouble is not None and trouble.kind is TroubleKind.PV_OUTSIDE_LIMITS
     assert trouble.text == "PV went above its limit of 50.5 degC under the new gains"
-    assert trouble.put_back and service.controller.state.gains == OLD
+    assert trouble.rolled_back and service.controller.state.gains == OLD
 
 
 def _limited(service: Service) -> WatchedLoop:
@@ -244,7 +245,7 @@ def test_a_service_that_is_started_while_pv_is_outside_knows_that_it_was_inside(
     here.plant.disturbance = 2.0
     here.watching = here.another()
     here.goes_on(3.0)
-    assert here.watch.trouble is not None and here.watch.trouble.put_back
+    assert here.watch.trouble is not None and here.watch.trouble.rolled_back
     assert service.controller.state.gains == OLD
 
 
@@ -260,7 +261,7 @@ def test_pv_that_was_never_inside_does_not_leave_its_limits(service: Service) ->
 @pytest.mark.parametrize("shown", ["last", 50.2, 25.0, 0.0, 100.0])
 @pytest.mark.parametrize("roll_back", [True, False])
 def test_a_false_pv_is_an_alarm_and_nothing_is_written(service: Service, shown: float | str, roll_back: bool) -> None:
-    """Also one that is outside of the limits, where the old gains would come back."""
+    """Also one that is outside of the limits, where the previous gains would come back."""
     limits = service.loops[TAG].pv_limits.model_copy(update={"low": 40.0, "high": 60.0})
     service.loops[TAG] = service.loops[TAG].model_copy(update={"pv_limits": limits})
     here = WatchedLoop(service)
@@ -270,12 +271,12 @@ def test_a_false_pv_is_an_alarm_and_nothing_is_written(service: Service, shown: 
     here.shown = lambda pv: last if isinstance(shown, str) else shown
     here.goes_on(6.0)
     trouble = here.watch.trouble
-    assert trouble is not None and (trouble.kind, trouble.put_back) == (TroubleKind.FALSE_PV, False)
+    assert trouble is not None and (trouble.kind, trouble.rolled_back) == (TroubleKind.FALSE_PV, False)
     assert service.controller.state == before and service.controller.session == 0
     assert service.store.get(here.job_id).state is JobState.ACCEPTED
-    assert "no reason to change gains" in here.watch.words
+    assert "no reason to change gains" in here.watch.message
     (alarm,) = AlarmWatch(service.jobs, Listening(service.jobs.directory.loops, service.store, on=False)).look()
-    assert (alarm.level, alarm.kind) == (1, "false_pv") and alarm.text.startswith("PV is false. PV ")
+    assert (alarm.priority, alarm.kind) == (1, "false_pv") and alarm.text.startswith("PV is false. PV ")
     assert "it is in automatic on this PV unless you put it in manual" in alarm.advice
 
 
@@ -313,9 +314,9 @@ def test_where_frames_are_lost_the_mode_heard_last_counts_and_the_controller_is_
     here.goes_on(3.0)
     trouble = here.watch.trouble
     assert trouble is not None and trouble.kind is TroubleKind.PV_OUTSIDE_LIMITS
-    assert trouble.put_back == (mode is Mode.AUTOMATIC)
-    assert service.controller.state.gains == (OLD if trouble.put_back else NEW)
-    assert trouble.put_back or "the mode was changed" in str(trouble.why_not) or "is in manual" in str(trouble.why_not)
+    assert trouble.rolled_back == (mode is Mode.AUTOMATIC)
+    assert service.controller.state.gains == (OLD if trouble.rolled_back else NEW)
+    assert trouble.rolled_back or "the mode was changed" in str(trouble.reason) or "is in manual" in str(trouble.reason)
 
 
 def _not_asked_for(here: WatchedLoop) -> None:
@@ -355,18 +356,18 @@ def test_the_old_gains_are_not_put_back_where_that_is_in_doubt(
     service: Service, client: TestClient, meanwhile: Callable[[WatchedLoop], None], why: str
 ) -> None:
     here = WatchedLoop(service, factor=unstable_from(10.0))
-    here.accept(roll_back_by_itself=meanwhile is not _not_asked_for)
+    here.accept(auto_rollback=meanwhile is not _not_asked_for)
     here.goes_on(2.0)
     meanwhile(here)
     held = service.controller.state.gains
     here.goes_on(20.0, 1.0)
     trouble = here.watch.trouble
-    assert trouble is not None and trouble.put_back is False
-    assert trouble.why_not is not None and why in trouble.why_not
+    assert trouble is not None and trouble.rolled_back is False
+    assert trouble.reason is not None and why in trouble.reason
     assert service.controller.state.gains == held and service.store.get(here.job_id).state is JobState.ACCEPTED
     service.controller.absent = None
     alarm = client.get("/alarms").json()[0]
-    assert (alarm["level"], alarm["kind"]) == (1, "suspect_gains") and why in alarm["advice"]
+    assert (alarm["priority"], alarm["kind"]) == (1, "suspect_gains") and why in alarm["advice"]
     here.goes_on(5.0)
     assert here.watch.trouble == trouble, "it is tried once"
 
@@ -398,8 +399,8 @@ def test_what_a_service_has_left_half_done_is_not_tried_again(
     here.watching = here.another()
     here.goes_on(1.0)
     trouble = here.watch.trouble
-    assert trouble is not None and trouble.put_back is False
-    assert "the service ended, or could not write it down" in str(trouble.why_not)
+    assert trouble is not None and trouble.rolled_back is False
+    assert "the service ended, or could not write it down" in str(trouble.reason)
     assert service.controller.state.gains == NEW
 
 
@@ -407,7 +408,7 @@ def test_what_a_service_has_left_half_done_is_not_tried_again(
 def test_what_is_known_of_a_rollback_whose_answer_is_lost(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch, kept: bool
 ) -> None:
-    """The old gains are in effect; whether that was stored is told by the job."""
+    """The previous gains are in effect; whether that was stored is told by the job."""
     here = WatchedLoop(service, factor=unstable_from(5.0))
     here.accept()
     answers, move = LosesAnswers(service.store, monkeypatch), service.store.move
@@ -423,7 +424,7 @@ def test_what_is_known_of_a_rollback_whose_answer_is_lost(
     here.goes_on(1.0)
     trouble = here.watch.trouble
     assert service.controller.state.gains == OLD and answers.lost and trouble is not None
-    assert (service.store.get(here.job_id).state, trouble.put_back) == ("rolled_back" if kept else "accepted", kept)
+    assert (service.store.get(here.job_id).state, trouble.rolled_back) == ("rolled_back" if kept else "accepted", kept)
     alarms(client, "rolled_back" if kept else "suspect_gains")
 
 
@@ -453,19 +454,19 @@ def test_a_loop_that_is_not_heard_is_not_said_to_be_confirmed(service: Service, 
     three_changes(here)
     watch = here.watch
     assert (watch.conclusion().state, watch.end, watch.changes) == (ModelState.OPEN, None, ())
-    assert "The loop is not heard: no data of the loop" in watch.words
-    assert client.get(f"/jobs/{here.job_id}").json()["watch"]["not_heard"] == "no data of the loop"
+    assert "No data of the loop: no data of the loop" in watch.message
+    assert client.get(f"/jobs/{here.job_id}").json()["monitoring"]["no_data"] == "no data of the loop"
     here.heard_at_all = True
     here.goes_on(2.0)
-    assert here.watch.not_heard is None
+    assert here.watch.no_data is None
     here.goes_on(13.0, 1.0)
     assert here.watch.conclusion().confirmed == 1, "a change of the time in which nothing was heard does not count"
 
 
 def test_accepting_asks(service: Service, client: TestClient) -> None:
     here = WatchedLoop(service)
-    answer = client.post(f"/jobs/{here.job_id}/accept", json={"by": "A", "roll_back_by_itself": False}).json()
-    assert (answer["watch"]["roll_back_by_itself"], answer["watch"]["going_on"]) == (False, True)
+    answer = client.post(f"/jobs/{here.job_id}/accept", json={"by": "A", "auto_rollback": False}).json()
+    assert (answer["monitoring"]["auto_rollback"], answer["monitoring"]["active"]) == (False, True)
     client.post(f"/jobs/{here.job_id}/rollback", json={"by": "A"})
     again = WatchedLoop(service)
-    assert client.post(f"/jobs/{again.job_id}/accept").json()["watch"]["roll_back_by_itself"] is True, "the default"
+    assert client.post(f"/jobs/{again.job_id}/accept").json()["monitoring"]["auto_rollback"] is True, "the default"

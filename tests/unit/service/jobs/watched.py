@@ -97,8 +97,8 @@ class WatchedLoop:
             lambda: self.now_s, lambda: self.passed_s,
         )  # type: ignore[arg-type]  # fmt: skip
 
-    def accept(self, roll_back_by_itself: bool = True) -> None:
-        self.service.jobs.decisions.accept(self.job_id, "operator A", roll_back_by_itself)
+    def accept(self, auto_rollback: bool = True) -> None:
+        self.service.jobs.decisions.accept(self.job_id, "operator A", auto_rollback)
         self.now_s = max(self.now_s, time.time())  # the acceptance has the time of this machine
 
     def clock_is_set(self, by_s: float) -> None:

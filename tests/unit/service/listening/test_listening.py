@@ -153,9 +153,9 @@ def test_a_bus_that_is_not_listened_to_says_why(store: Store, bus: str, on: bool
     site = parse_site({"loops": [loop_entry() | {"bus": bus}], "buses": {bus: {"listen": listen}}}, "test")
     listening = Listening(site.loops, store, None, site.buses, on)
     found = listening.history(TAG, T0, T0 + 10.0, 10)
-    assert found.not_heard is not None and why in found.not_heard
+    assert found.no_data is not None and why in found.no_data
     assert (bus in listening.off) == (why != "has not begun")
-    assert "another host" in (listening.history("ELSEWHERE", T0, T0 + 10.0, 10).not_heard or "")
+    assert "another gateway" in (listening.history("ELSEWHERE", T0, T0 + 10.0, 10).no_data or "")
 
 
 def test_a_bus_is_not_called_heard_before_the_first_report(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,13 +36,13 @@ def covers(found: dict[str, Any], at_s: float) -> bool:
 
 def test_a_loop_is_heard_read_and_kept_over_deaths(site: Site) -> None:
     found = site.until(lambda found: len(found["at_s"]) > 20 and found["gains"][-1] is not None)
-    assert found["not_heard"] is None and found["gains"][0] is None, "what was not read yet is unknown"
+    assert found["no_data"] is None and found["gains"][0] is None, "what was not read yet is unknown"
     assert (found["sp"][-1], found["mode"][-1]) == (50.0, "automatic")
     assert found["gain_sets"][found["gains"][-1]] == {
         "form": "ISA", "Kp": 0.5, "Ti": 20.0, "Td": 0.0, "Tf": 0.0, "b": 1.0, "c": 0.0
     }  # fmt: skip
     assert len(site.history(points=5)["at_s"]) <= 5
-    until(lambda: site.metric("loopwright_frames_heard_total") > 40)
+    until(lambda: site.metric("loopwright_frames_received_total") > 40)
     assert site.metric("loopwright_listening_up") == 1
 
     # An operator's set-point comes by a status, the service's own reading is not needed.
@@ -79,8 +79,8 @@ def test_a_bus_that_goes_down_and_comes_back_is_a_gap(site: Site) -> None:
     site.until(lambda found: len(found["at_s"]) > 5)
     port = site.bus.rpartition(":")[2]
     site.hub.kill()
-    found = site.until(lambda found: found["not_heard"])
-    assert "socketcand" in found["not_heard"] and site.metric("loopwright_listening_up") == 0
+    found = site.until(lambda found: found["no_data"])
+    assert "socketcand" in found["no_data"] and site.metric("loopwright_listening_up") == 0
     site.run("hub again", "loopwright.protocol.hub", "--port", port)
-    site.until(lambda found: found["not_heard"] is None)
+    site.until(lambda found: found["no_data"] is None)
     assert site.metric("loopwright_listener_restarts_total") == 0

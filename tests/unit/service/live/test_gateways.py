@@ -66,7 +66,7 @@ def test_a_loop_of_another_gateway_is_shown_as_it_is_there(fleet: TwoGateways) -
     hears(fleet)
     found = detail(fleet)
     live = found["live"]
-    assert found["host"] == THERE and found["live_error"] is None
+    assert found["gateway"] == THERE and found["live_error"] is None
     assert (live["pv"], live["sp"], live["mv"], live["mode"], live["on_trial"]) == (
         49.5,
         50.0,
@@ -76,7 +76,7 @@ def test_a_loop_of_another_gateway_is_shown_as_it_is_there(fleet: TwoGateways) -
     )
     assert (live["gains"]["Kp"], live["gains"]["Ti"], live["sample_time_s"]) == (OLD.Kp, OLD.Ti, 0.1)
     assert (live["mv_low"], live["mv_high"], live["reverse_acting"]) == (0.0, 100.0, True)
-    assert fleet.here.http.get(f"/loops/{TAG_HERE}").json()["host"] == HERE
+    assert fleet.here.http.get(f"/loops/{TAG_HERE}").json()["gateway"] == HERE
 
 
 def test_gains_that_differ_from_those_accepted_are_seen_from_another_gateway(fleet: TwoGateways) -> None:
@@ -110,8 +110,8 @@ def test_old_rows_are_not_shown_as_new(fleet: TwoGateways, age_s: float, words: 
         assert found["live_error"]["reason"] == "gateway_lost" and found["live_error"]["advice"]
     row = fleet.here.others.values(TAG_THERE, THERE)
     assert (row.pv is None) == (words is not None)
-    assert (row.not_heard is None) == (words is None)
-    last = found["last_heard"]
+    assert (row.no_data is None) == (words is None)
+    last = found["last_data"]
     if words is None:
         assert last is None and row.last is None
     else:
@@ -148,7 +148,7 @@ def test_a_loop_that_is_silent_there_has_the_age_of_its_last_sample(fleet: TwoGa
     fleet.write()
     fleet.age(5.0)
     found = detail(fleet)
-    assert found["live"] is None and found["last_heard"]["pv"] == 49.5 and found["last_heard"]["age_s"] > 65.0
+    assert found["live"] is None and found["last_data"]["pv"] == 49.5 and found["last_data"]["age_s"] > 65.0
 
 
 def test_what_a_job_has_read_is_as_old_as_what_its_gateway_has_said(fleet: TwoGateways) -> None:
@@ -170,8 +170,8 @@ def test_what_a_job_has_read_is_as_old_as_what_its_gateway_has_said(fleet: TwoGa
 
 def test_a_loop_that_was_never_heard_has_no_old_values(fleet: TwoGateways) -> None:
     fleet.age(5.0)
-    assert detail(fleet)["last_heard"] is None
-    assert detail_here(fleet)["last_heard"] is None
+    assert detail(fleet)["last_data"] is None
+    assert detail_here(fleet)["last_data"] is None
 
 
 def test_a_loop_of_this_gateway_that_has_fallen_silent(fleet: TwoGateways) -> None:
@@ -179,13 +179,13 @@ def test_a_loop_of_this_gateway_that_has_fallen_silent(fleet: TwoGateways) -> No
     fleet.here.controller.absent = Reason.NODE_LOST
     found = detail_here(fleet)
     assert found["live"] is None and found["live_error"]["reason"] == "node_lost"
-    assert found["last_heard"]["pv"] == 49.5 and found["last_heard"]["age_s"] > 59.0
+    assert found["last_data"]["pv"] == 49.5 and found["last_data"]["age_s"] > 59.0
 
 
 def test_how_far_a_job_of_the_other_gateway_has_come(fleet: TwoGateways) -> None:
     """Of a gateway that says nothing it is what its job has stored: nothing before its first stage."""
     fleet.there.tune.hold.clear()
-    job = fleet.there.http.post(f"/loops/{TAG_THERE}/retune", json={"requested_by": "me"}).json()["url"]
+    job = fleet.there.http.post(f"/loops/{TAG_THERE}/retune", json={"by": "me"}).json()["url"]
     assert fleet.there.tune.inside.wait(60)
     fleet.write()
 
@@ -218,7 +218,7 @@ def test_a_bus_that_is_down_there(fleet: TwoGateways) -> None:
     fleet.write()
     error = detail(fleet)["live_error"]
     assert error["reason"] == "bus_lost" and error["detail"] == f"gateway {THERE}: nobody is there"
-    assert [(bus.host, bus.up) for bus in fleet.here.others.buses()] == [(THERE, False)]
+    assert [(bus.gateway, bus.up) for bus in fleet.here.others.buses()] == [(THERE, False)]
 
 
 def test_the_gateways(fleet: TwoGateways) -> None:
@@ -371,23 +371,23 @@ def test_the_stream_shows_rows_buses_and_progress_of_the_other_gateway(fleet: Tw
 
     app = app_of(fleet.here.jobs, checks={}, listening=fleet.here.listening, live=live, others=fleet.here.others)
     fleet.there.tune.hold.clear()
-    job = fleet.there.http.post(f"/loops/{TAG_THERE}/retune", json={"requested_by": "me"}).json()["url"]
+    job = fleet.there.http.post(f"/loops/{TAG_THERE}/retune", json={"by": "me"}).json()["url"]
     assert fleet.there.tune.inside.wait(20)
     with served(app) as door:
         try:
             hears(fleet)
             with viewing(f"http://127.0.0.1:{door.port}", f"/live?loops={TAG_THERE}") as viewer:
                 row = viewer.row(TAG_THERE, lambda row: row["pv"] is not None)
-                assert (row["host"], row["pv"], row["mode"], row["not_heard"]) == (THERE, 49.5, "automatic", None)
+                assert (row["gateway"], row["pv"], row["mode"], row["no_data"]) == (THERE, 49.5, "automatic", None)
                 assert row["job"] == job and row["last_job"]["state"] == "running"
                 viewer.becomes("jobs", lambda found: found.get("jobs") and found["jobs"][0]["progress"] is not None)
-                viewer.becomes("buses", lambda found: any(bus["host"] == THERE for bus in found.get("buses", [])))
+                viewer.becomes("buses", lambda found: any(bus["gateway"] == THERE for bus in found.get("buses", [])))
                 fleet.age(12.0)
                 row = viewer.row(TAG_THERE, lambda row: row["pv"] is None)
-                viewer.row(TAG_THERE, lambda row: f"gateway {THERE} does not answer" in row["not_heard"])
-                assert row["host"] == THERE and row["job"] == job
+                viewer.row(TAG_THERE, lambda row: f"gateway {THERE} does not answer" in row["no_data"])
+                assert row["gateway"] == THERE and row["job"] == job
                 fleet.here.sql("DELETE FROM gateways")
-                viewer.row(TAG_THERE, lambda row: "has not run since" in row["not_heard"])
+                viewer.row(TAG_THERE, lambda row: "has not run since" in row["no_data"])
         finally:
             live.close()
 

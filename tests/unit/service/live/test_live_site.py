@@ -43,10 +43,10 @@ def test_samples_come_once_and_what_stops_is_no_longer_shown(site: Site) -> None
         assert gaps == [0, *stood_still], "no gap but where a busy machine let the plant stand still"
 
         row = viewer.row(TAG, lambda row: row["mode"])
-        assert (row["mode"], row["sp"], row["not_heard"], row["on_trial"]) == ("automatic", 50.0, None, False)
+        assert (row["mode"], row["sp"], row["no_data"], row["on_trial"]) == ("automatic", 50.0, None, False)
         assert row["age_s"] < 3.0 and row["pv"] is not None and row["mv"] is not None
         buses = [message for name, message in viewer.messages if name == "buses"]
-        assert buses[-1] == {"buses": [{"host": "local", "bus": site.bus, "up": True, "why": None}]}
+        assert buses[-1] == {"buses": [{"gateway": "local", "bus": site.bus, "up": True, "why": None}]}
 
         tuner = Tuner(site.bus, CONTROLLER_NODE, PLANT_NODE)
         tuner.write("controller_setpoint", 50.5)
@@ -57,7 +57,7 @@ def test_samples_come_once_and_what_stops_is_no_longer_shown(site: Site) -> None
         site.plant.stop()
         row = viewer.row(TAG, lambda row: row["pv"] is None)
         assert row["sp"] is row["mv"] is row["mode"] is None and row["age_s"] > 3.0
-        assert row["not_heard"].startswith("no data for ")
+        assert row["no_data"].startswith("no data for ")
         viewer.becomes("alarms", lambda message: [each["kind"] for each in message.get("alarms", [])] == ["node_lost"])
         (alarm,) = site.http.get("/alarms").json()
         assert (alarm["level"], alarm["subject"], alarm["loops"]) == (2, f"node 10h on {site.bus}", [TAG])
@@ -66,7 +66,7 @@ def test_samples_come_once_and_what_stops_is_no_longer_shown(site: Site) -> None
         site.hub.stop()
         down = viewer.until("buses", lambda message: message["buses"][0]["up"] is False)
         assert down["buses"][0]["why"]
-        row = viewer.row(TAG, lambda row: site.bus in row["not_heard"])
+        row = viewer.row(TAG, lambda row: site.bus in row["no_data"])
         assert row["pv"] is None
         viewer.becomes("alarms", lambda message: [each["kind"] for each in message.get("alarms", [])] == ["bus_down"])
         assert site.service.stop() == 0

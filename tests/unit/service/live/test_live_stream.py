@@ -72,33 +72,33 @@ def test_what_comes_first(screens: Screens) -> None:
         assert viewer.answer.headers["content-type"].startswith("text/event-stream")
         assert viewer.answer.headers["x-accel-buffering"] == "no"
         hello = viewer.until("hello")
-        assert (hello["host"], hello["loops"], hello["back_s"]) == ("local", [TAG], 10.0)
+        assert (hello["gateway"], hello["loops"], hello["back_s"]) == ("local", [TAG], 10.0)
         assert abs(hello["now_s"] - time.time()) < 60.0
         assert viewer.until("samples") == {
             "tag": TAG, "past": True, "n": [], "at_s": [], "sp": [], "pv": [], "mv": [], "mode": [], "gap_before": [],
         }  # fmt: skip
         row = viewer.row(TAG)
         assert row["pv"] is row["sp"] is row["mv"] is row["mode"] is row["age_s"] is row["under_test"] is None
-        assert row["not_heard"] == "listening is turned off"
+        assert row["no_data"] == "listening is turned off"
         viewer.becomes("jobs", lambda message: message.get("jobs") == [])
         viewer.becomes("buses", bool)
         found = dict(viewer.messages)
         assert found["buses"]["buses"] == [
-            {"host": "local", "bus": "virtual:test", "up": None, "why": "listening is turned off"}
+            {"gateway": "local", "bus": "virtual:test", "up": None, "why": "listening is turned off"}
         ]
 
 
 def test_every_viewer_sees_a_test_from_its_first_event_to_its_decision(screens: Screens) -> None:
     service = screens.service
     service.tune.hold.clear()
-    job = service.jobs.start(TAG, FastRetune(requested_by="A. Lind")).id
+    job = service.jobs.start(TAG, FastRetune(by="A. Lind")).id
     until(lambda: service.store.get(job).state == "running")
     with (
         viewing(screens.base, f"/live?loops={TAG}") as early,
         viewing(screens.base) as elsewhere,
     ):
         live = early.until("jobs", lambda message: message["jobs"])["jobs"][0]
-        assert (live["id"], live["loop"], live["requested_by"], live["stopping"]) == (job, TAG, "A. Lind", False)
+        assert (live["id"], live["loop"], live["by"], live["stopping"]) == (job, TAG, "A. Lind", False)
         assert early.row(TAG, lambda row: row["job"])["last_job"] == {"url": f"/jobs/{job}", "state": "running"}
         service.tune.hold.set()
         early.until("job", lambda each: each["data"].get("state") == "proposed")
@@ -129,7 +129,7 @@ def test_alarms_come_first_and_on_every_change_as_a_whole(screens: Screens) -> N
         assert (alarm["level"], alarm["loop"], alarm["text"]) == (3, TAG, "The last test failed: node lost")
         with viewing(screens.base) as later:
             later.becomes("alarms", lambda message: message.get("alarms") == [alarm])
-            screens.alarms.sign_off(alarm["id"], "A. Lind")
+            screens.alarms.acknowledge(alarm["id"], "A. Lind")
             for each in (viewer, later):
                 each.becomes("alarms", lambda message: message.get("alarms") == [])
         seen = [message for name, message in viewer.messages if name == "alarms"]
@@ -141,7 +141,7 @@ def test_many_viewers_ask_the_database_as_often_as_one(screens: Screens) -> None
 
     @database_event.listens_for(screens.service.store.engine, "before_cursor_execute")
     def _(*arguments: object) -> None:
-        if "jobs.dry_run, jobs.requested_by" in str(arguments[2]):  # no other query has these side by side
+        if "jobs.dry_run, jobs.by" in str(arguments[2]):  # no other query has these side by side
             asked.append(time.monotonic())
 
     with viewing(screens.base) as first:

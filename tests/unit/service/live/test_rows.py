@@ -38,7 +38,7 @@ HELD = LoopState(Mode.EXPERIMENT, 50.5, 49.0, math.nan, Gains(1.0, 2.0), True, 0
 def test_a_loop_that_is_heard() -> None:
     row = loop_row("A", "local", LiveFacts(HEARD, job=JOB, last_job=JOB), T0 + 0.06)
     assert (row.pv, row.sp, row.mv, row.mode, row.age_s) == (49.9, 50.0, 41.2, "automatic", 0.06)
-    assert (row.under_test, row.on_trial, row.not_heard, row.job) == (True, False, None, "/jobs/4f0c2a9be113")
+    assert (row.under_test, row.on_trial, row.no_data, row.job) == (True, False, None, "/jobs/4f0c2a9be113")
     assert row.last_job is not None and row.last_job.state is JobState.RUNNING
     assert row.locked_since is None
     assert loop_row("A", "local", LiveFacts(HEARD, locked_since="2026-01-31T12:00:00.000Z"), T0).locked_since
@@ -50,13 +50,13 @@ def test_what_is_not_known_is_null() -> None:
     assert row.pv is row.sp is row.mv is row.mode is row.under_test is row.on_trial is row.job is row.last_job is None
     assert row.age_s == 0.0, "a clock that was put back makes no negative age"
     row = loop_row("A", "local", LiveFacts(), T0)
-    assert row.pv is row.age_s is None and row.not_heard == "no sample has come yet"
+    assert row.pv is row.age_s is None and row.no_data == "no sample has come yet"
 
 
 def test_what_is_old_is_set_apart_with_its_age() -> None:
     row = loop_row("A", "local", LiveFacts(replace(HEARD, silent=True), held=HELD), T0 + 12.4)
     assert row.pv is row.sp is row.mv is row.mode is row.on_trial is None
-    assert (row.age_s, row.not_heard) == (12.4, "no data for 12 s")
+    assert (row.age_s, row.no_data) == (12.4, "no data for 12 s")
     assert row.last == OldValues(pv=49.9, sp=50.0, mv=41.2, mode="automatic")
     assert loop_row("A", "local", LiveFacts(HEARD), T0).last is None
 
@@ -65,8 +65,8 @@ def test_where_a_bus_is_not_heard_the_running_job_knows_the_loop() -> None:
     deaf = "a bus of the kind slcan cannot be opened by a second process"
     row = loop_row("A", "local", LiveFacts(deaf=deaf, held=HELD, job=JOB), T0)
     assert (row.pv, row.sp, row.mv, row.mode, row.on_trial) == (49.0, 50.5, None, "experiment", True)
-    assert row.under_test is True and row.not_heard is None and row.age_s is None
-    assert loop_row("A", "local", LiveFacts(deaf=deaf), T0).not_heard == deaf
+    assert row.under_test is True and row.no_data is None and row.age_s is None
+    assert loop_row("A", "local", LiveFacts(deaf=deaf), T0).no_data == deaf
 
 
 def test_samples_are_columns_with_their_gaps() -> None:

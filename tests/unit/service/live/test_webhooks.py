@@ -129,7 +129,7 @@ def test_a_proposal_and_its_acceptance_are_delivered_and_signed(
     assert message["type"] == "job.needs_decision" and message["data"] == {
         "id": job_id, "url": f"https://gw-1.example.com/jobs/{job_id}",
         "page": f"https://gw-1.example.com/ui/loops/{TAG}", "loop": TAG, "state": "proposed", "reason": None,
-        "detail": None, "dry_run": False, "requested_by": message["data"]["requested_by"], "host": "local",
+        "detail": None, "dry_run": False, "by": message["data"]["by"], "gateway": "local",
     }  # fmt: skip
     assert json.loads(other)["type"] == "job.ended" and json.loads(other)["data"]["state"] == "accepted"
     assert first["webhook-id"] != second["webhook-id"] and first["webhook-id"].startswith("msg_")

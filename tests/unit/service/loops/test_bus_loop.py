@@ -69,7 +69,7 @@ class TestBeginning:
     def test_tells_what_the_plant_does_when_the_controller_falls_silent(self, site: Site) -> None:
         for reaction, words in ((OnMissingAnswer.STOP_RUN, "stops its run"), (OnMissingAnswer.SAFE_OUTPUT, "of 50 %")):
             site.plant.dictionary.set("plant_on_missing_answer", reaction)
-            assert words in site.loop.read().when_silent
+            assert words in site.loop.read().fail_action
 
     @pytest.mark.parametrize("device", ["controller", "plant"])
     def test_versions_that_differ_are_named_on_both_sides(self, site: Site, device: str) -> None:
@@ -206,7 +206,7 @@ class TestLease:
         site.gateway.monotonic = others
         with pytest.raises(Failed) as caught:
             site.loop.step((SetSetpoint(50.1),))
-        assert caught.value.reason is Reason.DEVICE_WENT_BACK and site.channel.setpoint == 50.0
+        assert caught.value.reason is Reason.SESSION_ENDED_BY_DEVICE and site.channel.setpoint == 50.0
         assert TURN_S < site.wire.clock.now - began_at < TURN_S + LEASE_WALL_S
 
     def test_an_abort_does_not_wait_for_the_turn(self, site: Site) -> None:
@@ -257,7 +257,7 @@ class TestLease:
         with pytest.raises(Failed, match="cause: lease") as caught:
             for _ in range(100):
                 in_blocks.loop.step(())
-        assert caught.value.reason is Reason.DEVICE_WENT_BACK
+        assert caught.value.reason is Reason.SESSION_ENDED_BY_DEVICE
 
     def test_is_paid_while_a_slow_sample_is_waited_for(self) -> None:
         site = Site(Ts=60.0)

@@ -362,7 +362,7 @@ class TestTwoGateways:
         second.step((SetSetpoint(50.1),))
         with pytest.raises(Failed) as caught:
             site.loop.step((SetSetpoint(50.3),))
-        assert caught.value.reason is Reason.DEVICE_WENT_BACK
+        assert caught.value.reason is Reason.SESSION_ENDED_BY_DEVICE
         found = site.loop.restore(home, number)  # type: ignore[arg-type]
         assert "session" in found.changed and site.channel.setpoint == pytest.approx(50.1)
         assert second.restore(theirs).changed == {} and site.is_home()

@@ -53,7 +53,7 @@ def of_a_test(
     state = site.loop.read()
     given: dict[str, Any] = {
         "sample_time_s": site.plant.sample_time_s, "T95_s": T95_S, "mv_low": 0.0, "mv_high": 100.0,
-        "sp_deviation": STEP, "old_gains": state.gains, "pv_low": PV_LOW, "pv_high": PV_HIGH,
+        "sp_deviation": STEP, "previous_gains": state.gains, "pv_low": PV_LOW, "pv_high": PV_HIGH,
     }  # fmt: skip
     facts = Facts(**given | more)
     taken: list[Sample] = []

@@ -71,7 +71,7 @@ def test_an_abort_does_not_wait_for_the_next_sample(service: Service) -> None:
         stack.callback(jobs.stop)
         jobs.boot()
         client = TestClient(app_of(jobs, checks={}), base_url="http://127.0.0.1")
-        url = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()["url"]
+        url = client.post(f"/loops/{TAG}/retune", json={"by": "me"}).json()["url"]
         until(lambda: controller.sessions[0].is_open)
         until(lambda: client.get(url).json()["stage"] is not None)
         began = time.monotonic()

@@ -48,10 +48,10 @@ def finding(Ms: float | None = 1.30, uncertainty: float | None = 0.05, **changes
 def job(result: FastResult) -> Job:
     """An accepted job."""
     none = dict.fromkeys(
-        ("started_at", "ended_at", "stage", "stage_times_s", "reason", "detail", "old_gains", "restored", "found")
+        ("started_at", "ended_at", "stage", "stage_times_s", "reason", "detail", "previous_gains", "restored", "found")
     )
     return Job(
-        number=1, id="j2", loop="A", state=JobState.ACCEPTED, dry_run=False, request={}, requested_by="me",
+        number=1, id="j2", loop="A", state=JobState.ACCEPTED, dry_run=False, request={}, by="me",
         created_at="2026-02-01", plant_time_s=1.0, result=result, host="local", version="0", attempt=1, session=1,
-        look_after=False, stop_reason=None, false_pv=None, **none,
+        restore_unconfirmed=False, stop_reason=None, false_pv=None, **none,
     )  # fmt: skip

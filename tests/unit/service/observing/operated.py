@@ -69,8 +69,8 @@ class Operated:
 class HeardBefore:
     """A listening that has heard this, and nothing of any other loop; of present values it has none."""
 
-    def __init__(self, rings: Rings, not_heard: str | None = None) -> None:
-        self._rings, self._not_heard = rings, not_heard
+    def __init__(self, rings: Rings, no_data: str | None = None) -> None:
+        self._rings, self._not_heard = rings, no_data
         self.heard: dict[str, Heard] = {}
 
     def why_not_heard(self, tag: str) -> str | None:

@@ -41,7 +41,7 @@ def test_what_is_known_is_kept_however_many_changes_follow_that_know_less(
         keep(finding(1.31, 0.08, last_change_s=1000.0 * n))
     found = kept.of(A_JOB.loop, PRESENT)
     assert found is not None and (found.Ms, found.uncertainty) == (1.30, 0.02)
-    assert found.agreeing == stored.MAX_OF_A_LOOP == len(stored.read(store, A_JOB.loop)) - 1
+    assert found.consistent == stored.MAX_OF_A_LOOP == len(stored.read(store, A_JOB.loop)) - 1
 
 
 def test_one_that_later_ones_disagree_with_goes(kept: KeptKnowledge, keep: Keep, store: Store) -> None:
@@ -49,5 +49,5 @@ def test_one_that_later_ones_disagree_with_goes(kept: KeptKnowledge, keep: Keep,
     for n in range(1, stored.MAX_OF_A_LOOP + 1):
         keep(finding(1.70, 0.08, last_change_s=1000.0 * n))
     found = kept.of(A_JOB.loop, PRESENT)
-    assert found is not None and (found.Ms, found.older_plant) == (1.70, None)
+    assert found is not None and (found.Ms, found.superseded) == (1.70, None)
     assert len(stored.read(store, A_JOB.loop)) == stored.MAX_OF_A_LOOP

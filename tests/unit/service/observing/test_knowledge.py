@@ -27,8 +27,8 @@ def test_nothing_is_known_without_a_finding() -> None:
 def test_what_is_known_is_said_in_a_sentence() -> None:
     found = known(stored(finding(uncertainty=0.03)), PRESENT)
     assert found is not None and found.text == "Ms known to +-0.03 from 3 set-point changes of normal operation"
-    assert (found.Ms, found.uncertainty, found.changes, found.job, found.agreeing) == (1.30, 0.03, 3, None, 0)
-    assert found.proposed is not None and found.proposed.gains.gains() == PROPOSED and found.older_plant is None
+    assert (found.Ms, found.uncertainty, found.changes, found.job, found.consistent) == (1.30, 0.03, 3, None, 0)
+    assert found.proposed is not None and found.proposed.gains.gains() == PROPOSED and found.superseded is None
     one = known(stored(finding(changes=1)), PRESENT)
     assert one is not None and one.source_text == "1 set-point change of normal operation"
     test = known(stored(finding(**TEST)), PRESENT)
@@ -39,7 +39,7 @@ def test_the_least_uncertain_of_those_that_agree_is_what_is_known_and_nothing_is
     older, newer = finding(1.30, 0.02, **TEST), finding(1.36, 0.05)
     assert disagreeing(newer, stored(older)) == {}
     found = known(stored(older, newer), PRESENT)
-    assert found is not None and (found.Ms, found.uncertainty, found.agreeing) == (1.30, 0.02, 1)
+    assert found is not None and (found.Ms, found.uncertainty, found.consistent) == (1.30, 0.02, 1)
     equal = known(stored(finding(1.30), finding(1.31)), PRESENT)
     assert equal is not None and equal.Ms == 1.31, "of two alike the newer one"
 
@@ -56,8 +56,8 @@ def test_the_older_of_two_that_do_not_agree_is_of_an_older_plant() -> None:
     for words in ("job j1 (fast)", "2026-01-31T12:00", "Ms 1.3 +- 0.02", "Ms 1.5 +- 0.05", "another one since"):
         assert words in why
     found = known([Known(1, older, why), Known(2, newer, None)], PRESENT)
-    assert found is not None and (found.Ms, found.uncertainty, found.agreeing) == (1.50, 0.05, 0)
-    assert found.older_plant == why
+    assert found is not None and (found.Ms, found.uncertainty, found.consistent) == (1.50, 0.05, 0)
+    assert found.superseded == why
     assert disagreeing(newer, [Known(1, older, "already")]) == {}, "once is enough"
 
 

@@ -52,8 +52,8 @@ def row_of(model: TransferFunction, Ts: float) -> tuple[Any, Gains]:
     view = TransferModelView(structure="sopdt", num=list(model.num), den=list(model.den), dead_time_s=model.L)
     result = FastResult.model_construct(model=view, new_gains=GainsView.of(new))
     return SimpleNamespace(
-        id="j", loop="L", request={"method": "fast", "ms": 1.6}, state=JobState.PROPOSED, reason=None, result=result,
-        old_gains=before, found=state,
+        id="j", loop="L", request={"method": "fast", "Ms": 1.6}, state=JobState.PROPOSED, reason=None, result=result,
+        previous_gains=before, found=state,
     ), new  # fmt: skip
 
 
@@ -64,17 +64,17 @@ def test_page_report_and_alternatives_show_the_same_curve(name: str, monkeypatch
     row, _ = row_of(TransferFunction(num, den, L), Ts)
     curve = curve_of_designs.design_curve(row, TransferFunction(num, den, L), None)
     page = json.loads(curve.model_dump_json())
-    assert page["before_curves"] and page["after_curves"]
+    assert page["previous_curves"] and page["new_curves"]
     for of in (1.4, 1.6):
         other = redesigned(row, [], None, DesignSpec(of))["methods"][0]["curves"]
         mine = next(each["curves"] for each in page["designs"] if each["Ms_asked"] == of)
         if of == 1.6:  # the gains of the job
-            assert_same(mine, page["after_curves"])
+            assert_same(mine, page["new_curves"])
         assert_same(other, mine)
-    shown = step_pictures(curve.before_curves, curve.after_curves, 2.0, 1.6)
+    shown = step_pictures(curve.previous_curves, curve.new_curves, 2.0, 1.6)
     assert shown is not None
     for picture, which, size in ((shown.setpoint, "setpoint", 2.0), (shown.load, "load", LOAD_PCT)):
-        for look, curves in (("old", page["before_curves"]), ("new", page["after_curves"])):
+        for look, curves in (("old", page["previous_curves"]), ("new", page["new_curves"])):
             assert_drawn(picture, look, size * np.asarray(curves[which]["pv"]))
 
 

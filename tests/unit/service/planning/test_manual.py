@@ -141,4 +141,4 @@ def test_a_dry_run_is_in_manual_where_the_loop_is_or_where_nothing_else_is_asked
     outcome = rehearse(within(loop(BOTH | {"t95_s": 26.0}), request), request, hooks)
     assert outcome.ended is None, outcome.ended
     assert {sample.mode for sample in taken} == {int(Mode.MANUAL)}
-    assert outcome.result is not None and any("never tried" in note for note in outcome.result.notes)
+    assert outcome.result is not None and any("never tested" in note for note in outcome.result.notes)

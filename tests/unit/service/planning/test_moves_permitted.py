@@ -150,7 +150,7 @@ class TestPreview:
         assert "0.5 degC/s at most: 4 s for 2 degC" in verify.what
         moves = 2 if options == {"excitations": ["relay"]} else 7
         assert slow.duration_high_s == pytest.approx(free.duration_high_s + moves * 4.0)
-        assert "goes home at once, not by a ramp" in slow.on_abort and "by a ramp" not in free.on_abort
+        assert "returns at once, not by a ramp" in slow.on_abort and "by a ramp" not in free.on_abort
 
     def test_a_rate_at_which_pulses_tell_nothing_is_an_obstacle_with_numbers(self) -> None:
         found = told(config=SLOW, sp_rate_max_per_s=1e-4, excitations=["setpoint"])

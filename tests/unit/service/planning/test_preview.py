@@ -358,7 +358,7 @@ class TestHttp:
 
     def test_a_busy_loop_is_told_as_its_job_has_found_it(self, service: Service, client: TestClient) -> None:
         service.tune.hold.clear()
-        job = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()
+        job = client.post(f"/loops/{TAG}/retune", json={"by": "me"}).json()
         assert service.tune.inside.wait(5)
         service.controller.state = replace(service.controller.state, sp=52.0, mode=Mode.EXPERIMENT)
         found = self.ask(client)
@@ -371,17 +371,17 @@ class TestHttp:
         client.post(f"/loops/{TAG}/lock", json={"reason": "valve is being overhauled", "by": "night shift"})
         (obstacle,) = self.ask(client)["obstacles"]
         assert obstacle["reason"] == "locked" and "valve is being overhauled" in obstacle["detail"]
-        many = client.post("/retunes/preview", json={"loops": [TAG]}).json()
+        many = client.post("/batches/preview", json={"loops": [TAG]}).json()
         assert "locked" in str(many)
 
     def test_the_last_model_is_known_and_no_dry_run_counts(self, service: Service, client: TestClient) -> None:
         assert self.ask(client)["known"]["model_job"] is None
-        asked = [{"dry_run": dry, "requested_by": "me"} for dry in (False, True)]
+        asked = [{"dry_run": dry, "by": "me"} for dry in (False, True)]
         jobs = [client.post(f"/loops/{TAG}/retune", json=each).json()["id"] for each in asked]
         for job in jobs:
             service.wait(job)
         service.tune.ends = Failed(Reason.NODE_LOST, "silent")
-        service.wait(client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()["id"])
+        service.wait(client.post(f"/loops/{TAG}/retune", json={"by": "me"}).json()["id"])
         known = self.ask(client)["known"]
         assert (known["model_job"], known["Pu_s"]) == (f"/jobs/{jobs[0]}", 3.32)
         after = self.ask(client)
@@ -394,23 +394,23 @@ class TestHttp:
         service.controller.state = replace(service.controller.state, mode=Mode.MANUAL)
         found = self.ask(client, sp_deviation=3, mv_high=110)
         assert [each["reason"] for each in found["obstacles"]] == ["bad_limits", "bad_limits", "wrong_mode"]
-        assert client.post(f"/loops/{TAG}/retune/preview", json={"ms": 9}).status_code == 422
+        assert client.post(f"/loops/{TAG}/retune/preview", json={"Ms": 9}).status_code == 422
         assert client.post("/loops/NONE/retune/preview").status_code == 404
 
     def test_many_loops(self, service: Service, client: TestClient) -> None:
         service.controller.absent = Reason.NODE_LOST  # no controller is asked
-        answer = client.post("/retunes/preview", json={"pattern": "*", "amplitude_pct": 10})
+        answer = client.post("/batches/preview", json={"pattern": "*", "amplitude_pct": 10})
         found = answer.json()
         assert (found["count"], found["would_start"], found["largest_mv_move_pct"]) == (2, 2, 20.0)
         assert [each["loop"] for each in found["loops"]] == sorted(service.loops)
-        assert service.store.recent() == [] and client.get("/retunes").json() == []
-        refused = client.post("/retunes/preview", json={"loops": [TAG, "NONE"]})
+        assert service.store.recent() == [] and client.get("/batches").json() == []
+        refused = client.post("/batches/preview", json={"loops": [TAG, "NONE"]})
         assert refused.status_code == 422 and "NONE" in refused.json()["detail"]
 
     def test_a_key_that_may_only_read_may_ask(self) -> None:
-        for path in (f"/loops/{TAG}/retune/preview", "/retunes/preview", "/loops/{tag}/retune/preview"):
+        for path in (f"/loops/{TAG}/retune/preview", "/batches/preview", "/loops/{tag}/retune/preview"):
             assert scope_for("POST", path) is Scope.READ
-        for path in (f"/loops/{TAG}/retune", "/retunes", "/loops/a/b/retune/preview", f"/loops/{TAG}/retune/preview/x"):
+        for path in (f"/loops/{TAG}/retune", "/batches", "/loops/a/b/retune/preview", f"/loops/{TAG}/retune/preview/x"):
             assert scope_for("POST", path) is Scope.OPERATE
 
 

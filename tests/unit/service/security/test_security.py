@@ -122,7 +122,7 @@ def test_scopes(keyring: Keyring, open_client: Open, has: Scope, service: Servic
     client = open_client(keyring, key=keyring.create(has, has)[1])
     may_operate, may_admin = has in ("operate", "admin"), has == "admin"
     assert client.get("/loops").status_code == 200
-    answer = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"})
+    answer = client.post(f"/loops/{TAG}/retune", json={"by": "me"})
     assert answer.status_code == (202 if may_operate else 403)
     if not may_operate:
         assert "operate" in assert_problem(answer, 403)["detail"]
@@ -136,7 +136,7 @@ def test_no_key_no_answer(keyring: Keyring, open_client: Open, value: str) -> No
     answer = client.get("/loops", headers={"Authorization": value})
     assert_problem(answer, 401)
     assert answer.headers["www-authenticate"].startswith("Bearer")
-    assert_problem(client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}), 401)
+    assert_problem(client.post(f"/loops/{TAG}/retune", json={"by": "me"}), 401)
     assert_problem(client.get("/nowhere"), 401)
 
 
@@ -211,7 +211,7 @@ def test_which_addresses_are_this_machine(host: str, local: bool) -> None:
 @pytest.mark.parametrize("chunked", [False, True])
 def test_a_body_too_large(open_client: Open, chunked: bool, service: Service) -> None:
     client = open_client(body_bytes=2000)
-    body = json.dumps({"requested_by": "x" * 50}).encode() + b" " * 5000
+    body = json.dumps({"by": "x" * 50}).encode() + b" " * 5000
     content = iter([body[:1000], body[1000:]]) if chunked else body
     json_headers = {"content-type": "application/json"}
     assert_problem(client.post(f"/loops/{TAG}/retune", content=content, headers=json_headers), 413)
@@ -268,13 +268,13 @@ def trail(client: TestClient) -> list[dict[str, Any]]:
 def test_every_change_is_written_down(service: Service, keyring: Keyring, open_client: Open) -> None:
     boss, key = keyring.create("boss", Scope.ADMIN)
     client = open_client(keyring, key=key)
-    job = client.post(f"/loops/{TAG}/retune", json={"requested_by": "night shift"}).json()["id"]
+    job = client.post(f"/loops/{TAG}/retune", json={"by": "night shift"}).json()["id"]
     service.wait(job)
     client.post(f"/jobs/{job}/accept", json={"by": "operator A"})
     client.post(f"/jobs/{job}/accept")  # a 409 changes nothing
     client.post(f"/jobs/{job}/rollback")
     service.tune.hold.clear()
-    other = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()["id"]
+    other = client.post(f"/loops/{TAG}/retune", json={"by": "me"}).json()["id"]
     client.post(f"/jobs/{other}/abort")
     service.wait(other)
     found = trail(client)
@@ -283,11 +283,11 @@ def test_every_change_is_written_down(service: Service, keyring: Keyring, open_c
         ("abort", other),
     ]  # fmt: skip
     accept, rollback = found[3], found[2]
-    assert (accept["who"], accept["key_id"], accept["said_by"], accept["loop"]) == ("boss", boss.id, "operator A", TAG)
+    assert (accept["key"], accept["key_id"], accept["by"], accept["loop"]) == ("boss", boss.id, "operator A", TAG)
     assert (accept["before"]["state"], accept["after"]["state"]) == ("proposed", "accepted")
     assert (accept["before"]["gains"]["Kp"], accept["after"]["gains"]["Kp"]) == (OLD.Kp, NEW.Kp)
     assert (rollback["before"]["gains"]["Kp"], rollback["after"]["gains"]["Kp"]) == (NEW.Kp, OLD.Kp)
-    assert found[4]["after"]["requested_by"] == "night shift" and found[0]["before"] == {"state": "running"}
+    assert found[4]["after"]["by"] == "night shift" and found[0]["before"] == {"state": "running"}
     assert "hash" not in json.dumps(found) and key not in json.dumps(found)
 
 
@@ -295,12 +295,12 @@ def test_a_decision_that_failed_in_the_controller_is_written_down(
     service: Service, open_client: Open, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client = open_client()
-    job = client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"}).json()["id"]
+    job = client.post(f"/loops/{TAG}/retune", json={"by": "me"}).json()["id"]
     service.wait(job)
     service.controller.absent = Reason.NODE_LOST
     assert client.post(f"/jobs/{job}/accept").status_code == 503
     last = trail(client)[0]
-    assert (last["who"], last["what"], last["before"]) == ("local", "accept_failed", {"state": "proposed"})
+    assert (last["key"], last["what"], last["before"]) == ("local", "accept_failed", {"state": "proposed"})
     assert "node_lost" in last["after"]["error"]
     assert str(Failed(Reason.NODE_LOST, "node 32 does not answer").detail) in last["after"]["error"]
 
@@ -354,7 +354,7 @@ def test_no_key_gets_into_a_log(
     caplog.set_level(logging.DEBUG)
     _, key = keyring.create("a", Scope.OPERATE)
     client = open_client(keyring, key=key)
-    client.post(f"/loops/{TAG}/retune?key={key}", json={"requested_by": key})
+    client.post(f"/loops/{TAG}/retune?key={key}", json={"by": key})
     client.get(f"/jobs/{key}")
     logging.getLogger("loopwright.service").error("somebody typed %s", key)
     try:
@@ -367,7 +367,7 @@ def test_no_key_gets_into_a_log(
         lines = [formatter.format(record) for record in caplog.records]
         assert not any(secret in line for line in lines)
         assert any(key[:15] in line for line in lines)  # which key it was can be told
-        assert any("who=a" in line or '"who": "a"' in line for line in lines)
+        assert any("key=a" in line or '"key": "a"' in line for line in lines)
 
 
 # the commands
@@ -397,7 +397,7 @@ def test_keys_from_the_command_line(tmp_path: Path) -> None:
     service = Service(tmp_path / "data")
     rows = TestClient(app_of(service.jobs, checks={})).get("/audit").json()
     assert [row["what"] for row in rows] == ["key_revoke", "key_create", "key_create"]
-    assert all(row["who"].startswith("cli:") for row in rows)
+    assert all(row["key"].startswith("cli:") for row in rows)
     service.close()
 
 

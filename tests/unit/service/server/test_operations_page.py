@@ -132,7 +132,7 @@ def test_one_machine(machine: Machine) -> None:
     assert "whole; readable rows" in machine.run(damaged)
     assert '"ready":true' in machine.run(upgrade, key=new)
     (many,) = blocks("Many loops")
-    assert '"url":"/retunes/' in machine.run(many, key=new)
+    assert '"url":"/batches/' in machine.run(many, key=new)
     (look,) = blocks("Watch")
     assert '"level"' in machine.run(look)
 

@@ -20,9 +20,9 @@ from tests.unit.service.fakes import FakeTune, loop_entry
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--database", "postgresql://me:secret@127.0.0.1:1/none"], "needs --host"),
-        (["--database", "postgresql://me:secret@127.0.0.1:1/none", "--host", "a"], "the database cannot be used"),
-        (["--database", "mysql://me:secret@127.0.0.1:1/none", "--host", "a"], "not mysql://"),
+        (["--database", "postgresql://me:secret@127.0.0.1:1/none"], "needs --gateway"),
+        (["--database", "postgresql://me:secret@127.0.0.1:1/none", "--gateway", "a"], "the database cannot be used"),
+        (["--database", "mysql://me:secret@127.0.0.1:1/none", "--gateway", "a"], "not mysql://"),
     ],
 )
 def test_a_database_that_cannot_be_used_is_said_in_words(tmp_path: Path, options: list[str], words: str) -> None:

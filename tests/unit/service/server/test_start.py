@@ -53,7 +53,7 @@ def left(folder: Path) -> str:
     (folder / f"{TAG}.session").write_text(json.dumps({"number": SESSION, "home": state_json(HOME)}))
     with closing(Store(folder / "data")) as store:
         row = store.create(TAG, {}, "me", False, version=WORKFLOW_VERSION)
-        found = {"found": state_json(HOME), "old_gains": state_json(HOME)["gains"], "session": SESSION}
+        found = {"found": state_json(HOME), "previous_gains": state_json(HOME)["gains"], "session": SESSION}
         store.move(row.id, JobState.RUNNING, attempt=1, **found)
     return row.id
 

@@ -68,7 +68,7 @@ class Gateway:
         (self.folder / (f"go-{stage}" if stage else "go")).touch()
 
     def retune(self, tag: str = TAG, **options: Any) -> str:
-        answer = self.http.post(f"/loops/{tag}/retune", json={"requested_by": "me"} | options)
+        answer = self.http.post(f"/loops/{tag}/retune", json={"by": "me"} | options)
         assert answer.status_code == 202, answer.text
         return str(answer.headers["location"])
 
@@ -275,7 +275,7 @@ def test_a_gateway_that_comes_too_late_for_its_name_ends_its_tests(
     answer = gateway.http.get("/readyz")
     assert answer.status_code == 503
     assert f"process {other.pid} on" in answer.json()["parts"]["engine"]["detail"]
-    refused = gateway.http.post(f"/loops/{TAG}/retune", json={"requested_by": "me"})
+    refused = gateway.http.post(f"/loops/{TAG}/retune", json={"by": "me"})
     assert refused.status_code == 503 and "has taken the name" in refused.json()["detail"]
     # It is the other one's now, and nobody has ended it.
     gateway.until(url, lambda job: job["state"] == "running" and job["attempts"] == 2)
@@ -315,7 +315,7 @@ def test_two_gateways_on_one_database(stack: ExitStack, tmp_path: Path, postgres
     a = Gateway(stack, tmp_path / "a", database, "gw-a", ["A-1", "A-2"])
     b = Gateway(stack, tmp_path / "b", database, "gw-b", ["B-1"])
     for gateway in (a, b):
-        hosts = {loop["tag"]: loop["host"] for loop in gateway.http.get("/loops").json()}
+        hosts = {loop["tag"]: loop["gateway"] for loop in gateway.http.get("/loops").json()}
         assert hosts == {"A-1": "gw-a", "A-2": "gw-a", "B-1": "gw-b"}
     assert a.http.get("/loops/B-1").json()["live"] is None
     # Asked at the other one, run at home.
@@ -324,7 +324,7 @@ def test_two_gateways_on_one_database(stack: ExitStack, tmp_path: Path, postgres
         gateway.until(url, lambda job: job["stage"] == "relay" and job["attempts"] == 1)
     assert a.ran("A-1") == ["relay"] and b.ran("B-1") == ["relay"]
     assert not (tmp_path / "a" / "B-1.ran").exists() and not (tmp_path / "b" / "A-1.ran").exists()
-    assert b.http.post("/loops/A-1/retune", json={"requested_by": "me"}).status_code == 409
+    assert b.http.post("/loops/A-1/retune", json={"by": "me"}).status_code == 409
     a.process.kill()
     b.go()
     assert b.over(on_b)["attempts"] == 1
@@ -403,8 +403,8 @@ def test_a_database_that_is_restarted_before_a_decision_is_carried_out(
 
 @pytest.mark.parametrize(
     ("path", "body"),
-    [(f"/loops/{TAG}/retune", {"ms": 1.4, "requested_by": "me"}),
-     ("/retunes", {"pattern": "*", "requested_by": "me"})],
+    [(f"/loops/{TAG}/retune", {"Ms": 1.4, "by": "me"}),
+     ("/batches", {"pattern": "*", "by": "me"})],
 )  # fmt: skip
 def test_killed_before_it_has_answered_a_repetition_with_the_key_begins_nothing_twice(
     stack: ExitStack, tmp_path: Path, database: str | None, path: str, body: dict[str, Any]
@@ -421,4 +421,4 @@ def test_killed_before_it_has_answered_a_repetition_with_the_key_begins_nothing_
     gateway.go()
     gateway.until(first.headers["location"], lambda found: found["ended_at"] is not None, 60)
     assert len(gateway.http.get("/jobs").json()) == 1
-    assert len(gateway.http.get("/retunes").json()) == (path == "/retunes")
+    assert len(gateway.http.get("/batches").json()) == (path == "/batches")

@@ -221,6 +221,12 @@ def _other_tables(path: Path) -> None:
         made.execute("CREATE TABLE alembic_version (version_num)")
 
 
+def _never_released(path: Path) -> None:
+    with closing(sqlite3.connect(path)) as made:
+        made.execute("UPDATE alembic_version SET version_num = '0018'")
+        made.commit()
+
+
 def _newer(path: Path) -> None:
     with closing(sqlite3.connect(path)) as made:
         made.execute("UPDATE alembic_version SET version_num = '9999'")
@@ -228,7 +234,16 @@ def _newer(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "harm", [_cut, _scramble, _other_tables, _newer, Path.unlink, lambda path: path.write_bytes(b"no database")]
+    "harm",
+    [
+        _cut,
+        _scramble,
+        _other_tables,
+        _newer,
+        _never_released,
+        Path.unlink,
+        lambda path: path.write_bytes(b"no database"),
+    ],
 )
 def test_what_is_not_a_whole_back_up_is_refused_and_nothing_changes(data: Path, tmp_path: Path, harm: Any) -> None:
     done, _, _ = filled(data)
@@ -238,28 +253,6 @@ def test_what_is_not_a_whole_back_up_is_refused_and_nothing_changes(data: Path, 
         restore(tmp_path / "b", data, replace=True)
     store = Store(data)
     assert store.get(done).state == "proposed"
-    store.close()
-
-
-def test_a_back_up_of_the_first_revision_is_brought_to_the_present_one(data: Path, tmp_path: Path) -> None:
-    from alembic import command
-    from alembic.config import Config
-    from sqlalchemy import create_engine
-
-    engine = create_engine(f"sqlite:///{tmp_path / 'old'}")
-    config = Config()
-    config.set_main_option("script_location", "loopwright.service.store:migrations")
-    with engine.begin() as connection:
-        config.attributes["connection"] = connection
-        command.upgrade(config, "0001")
-        connection.exec_driver_sql(
-            "INSERT INTO jobs (id, loop, state, dry_run, request, requested_by, created_at, plant_time_s)"
-            " VALUES ('j1', 'A', 'running', 0, '{}', 'me', '2026-01-01T00:00:00.000Z', 3.0)"
-        )
-    engine.dispose()
-    assert restore(tmp_path / "old", data) == (1, None)
-    store = Store(data)
-    assert store.get("j1").state == "interrupted" and Keyring(store.engine).list() == []
     store.close()
 
 

@@ -225,7 +225,7 @@ def test_damage_under_the_running_service(service: Service, client: TestClient) 
         opened.seek(PAGE)
         opened.write(b"\xaa" * (file.stat().st_size - PAGE))
     service.store.engine.dispose()  # what a connection has read before, it does not read again
-    answers = [client.get("/jobs"), client.post(f"/loops/{TAG}/retune", json={"requested_by": "me"})]
+    answers = [client.get("/jobs"), client.post(f"/loops/{TAG}/retune", json={"by": "me"})]
     assert [answer.status_code for answer in answers] == [503, 503]
     for answer in answers:
         assert answer.headers["content-type"] == "application/problem+json" and "damaged" in answer.json()["detail"]
@@ -235,7 +235,7 @@ def test_damage_under_the_running_service(service: Service, client: TestClient) 
     until(lambda: service.jobs.stopping and service.controller.session == 0)
     until(lambda: not service.jobs.under_test())
     assert service.controller.state.gains == OLD and not service.controller.state.on_trial
-    refused = client.post("/loops/FIC-2/retune", json={"requested_by": "me"})
+    refused = client.post("/loops/FIC-2/retune", json={"by": "me"})
     assert refused.status_code == 503 and "damaged" in refused.json()["detail"]
 
 
@@ -272,7 +272,7 @@ def test_a_disk_that_takes_nothing_for_a_while(service: Service, client: TestCli
     until(lambda: service.controller.session == 0)  # the test runs to its end
     until(lambda: not (part := database(client))["ready"] and (words in part["detail"] or "nothing" in part["detail"]))
     if pragma == ONLY_READ:  # a small report may find room on a full disk
-        refused = client.post("/loops/FIC-2/retune", json={"requested_by": "me"})
+        refused = client.post("/loops/FIC-2/retune", json={"by": "me"})
         assert refused.status_code == 503 and refused.headers["retry-after"], refused.text
     assert service.store.get(job_id).state == "running"
     disk.pragma = ""
@@ -283,7 +283,7 @@ def test_a_disk_that_takes_nothing_for_a_while(service: Service, client: TestCli
     answers: list[Response] = []
 
     def accepted() -> bool:
-        answers.append(client.post("/loops/FIC-2/retune", json={"requested_by": "me"}))
+        answers.append(client.post("/loops/FIC-2/retune", json={"by": "me"}))
         return answers[-1].status_code == 202
 
     until(accepted)

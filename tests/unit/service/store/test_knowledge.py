@@ -14,7 +14,7 @@ def test_a_finding_comes_back_as_it_was(store: Store) -> None:
     knowledge.add(store, "A", given, {})
     knowledge.add(store, "B", finding(), {})
     (found,) = knowledge.read(store, "A")
-    assert (found.finding, found.older_plant) == (given, None)
+    assert (found.finding, found.superseded) == (given, None)
 
 
 def test_of_an_older_plant_or_in_the_place_of_another(store: Store) -> None:
@@ -24,7 +24,7 @@ def test_of_an_older_plant_or_in_the_place_of_another(store: Store) -> None:
     knowledge.add(store, "A", finding(1.5), {first: "the plant is another one"}, [third])
     assert numbers(store)[:2] == [first, second] and len(numbers(store)) == 3
     found = knowledge.read(store, "A")
-    assert [each.older_plant for each in found] == ["the plant is another one", None, None]
+    assert [each.superseded for each in found] == ["the plant is another one", None, None]
     assert found[-1].finding.present.Ms == 1.5
 
 

@@ -20,7 +20,7 @@ BEGUN, ENDED, AT = "2026-01-31T12:00:00.000Z", "2026-01-31T12:10:00.000Z", "2026
 
 def job(state: JobState, **changes: object) -> JobRow:
     return JobRow(
-        id="4f0c", loop="TIC-101", state=state, requested_by="A. Lind", created_at=BEGUN, started_at=BEGUN,
+        id="4f0c", loop="TIC-101", state=state, by="A. Lind", created_at=BEGUN, started_at=BEGUN,
         ended_at=ENDED, **changes,
     )  # fmt: skip
 
@@ -44,11 +44,11 @@ def test_a_loop_that_a_job_has(state: JobState, changes: dict[str, object], said
 
 @pytest.mark.parametrize(("now", "wanted", "said"), [
     (JobState.ACCEPTED, JobState.ACCEPTED, f"job 4f0c was accepted by B. Berg at {AT}: its gains are written already. "
-     "To go back to the old gains, roll it back"),
+     "To go back to the previous gains, roll it back"),
     (JobState.ROLLED_BACK, JobState.ACCEPTED, f"job 4f0c was rolled back by B. Berg at {AT}: its gains can be written "
      "no more. For new ones, retune the loop"),
     (JobState.ACCEPTED, JobState.ABORTED, f"job 4f0c was accepted by B. Berg at {AT}: nothing runs that could be "
-     "stopped. To go back to the old gains, roll it back"),
+     "stopped. To go back to the previous gains, roll it back"),
     (JobState.PROPOSED, JobState.ABORTED, f"job 4f0c ended at {ENDED} as proposed: nothing runs that could be "
      "stopped. Accept its proposal, or roll it back"),
     (JobState.QUEUED, JobState.ACCEPTED, f"job 4f0c of A. Lind has been waiting for its turn since {BEGUN}: there are "
@@ -79,13 +79,13 @@ def problem_of(service: Service, path: str) -> str:
 
     from tests.unit.service.apps import app_of
 
-    answer = TestClient(app_of(service.jobs, checks={})).post(path, json={"requested_by": "me"})
+    answer = TestClient(app_of(service.jobs, checks={})).post(path, json={"by": "me"})
     return str(assert_problem(answer, 409)["detail"])
 
 
 def test_over_rest(service: Service) -> None:
     service.tune.hold.clear()
-    row = service.jobs.start(TAG, FastRetune(requested_by="A. Lind"))
+    row = service.jobs.start(TAG, FastRetune(by="A. Lind"))
     assert service.tune.inside.wait(60)
     busy = problem_of(service, f"/loops/{TAG}/retune")
     assert busy.startswith(f"loop {TAG} is busy with job {row.id} of A. Lind, under way since 20")

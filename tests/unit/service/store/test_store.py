@@ -12,10 +12,9 @@ from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection, inspect, text
+from sqlalchemy import text
 from sqlalchemy.exc import IntegrityError, StatementError
 
-from loopwright.service.results import FiveStageResult, GainsView
 from loopwright.service.states.job_state import MOVES, IllegalMove, JobState
 from loopwright.service.store import database as opening
 from loopwright.service.store import lock
@@ -25,7 +24,6 @@ from loopwright.service.store.jobs import UnknownWord
 from loopwright.service.store.lock import FolderInUse
 from loopwright.service.store.store import Busy, ForeignLoop, Store
 from loopwright.service.store.tables import Base
-from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Sample
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.fakes import add_samples
@@ -45,10 +43,20 @@ def test_a_present_database_is_opened_without_migrations(store: Store, monkeypat
     assert opening.revision(store.engine) == opening.present_revision() == head
     monkeypatch.setattr(command, "upgrade", Mock(side_effect=AssertionError("migrated again")))
     opening.migrate(store.engine)
+
+
+@pytest.mark.parametrize(
+    ("revision", "said"), [("0018", "from before 0.1.0.*start with a new data folder"), ("9999", "a newer version")]
+)
+def test_tables_of_another_time_are_refused_and_left_as_they_were(tmp_path: Path, revision: str, said: str) -> None:
+    store = Store(tmp_path)
     with store.engine.begin() as connection:
-        connection.execute(text("UPDATE alembic_version SET version_num = '0012'"))
-    with pytest.raises(AssertionError, match="migrated again"):
-        opening.migrate(store.engine)
+        connection.execute(text("UPDATE alembic_version SET version_num = :it"), {"it": revision})
+    store.close()
+    before = (tmp_path / opening.FILE).read_bytes()
+    with pytest.raises(BadDatabase, match=said):
+        Store(tmp_path)
+    assert (tmp_path / opening.FILE).read_bytes() == before
 
 
 def test_a_word_that_is_not_known_names_its_job(store: Store) -> None:
@@ -63,48 +71,11 @@ def test_a_word_that_is_not_known_names_its_job(store: Store) -> None:
         store.note(good.id, reason="full_moon")
 
 
-def migrate(connection: Connection, revision: str) -> None:
-    config = Config()
-    config.set_main_option("script_location", "loopwright.service.store:migrations")
-    config.attributes["connection"] = connection
-    (command.upgrade if revision == "head" else command.downgrade)(config, revision)
-
-
-def test_a_store_of_the_revision_before_is_taken_over_with_its_data(store: Store) -> None:
-    """Down to the revision before, data put there as its code did, and up again."""
-    with store.engine.begin() as connection:
-        migrate(connection, "0001")
-        assert "host" not in {column["name"] for column in inspect(connection).get_columns("jobs")}
-        connection.execute(
-            text(
-                "INSERT INTO jobs (id, loop, state, dry_run, request, requested_by, created_at, plant_time_s, result)"
-                " VALUES ('old', 'A', 'proposed', :no, '{\"start\": \"relay\"}', 'me', '2026-01-01', 12.5,"
-                " '{\"gains\": {\"Kp\": 2.0}}'), ('cut', 'A', 'running', :no, '{}', 'me', '2026-01-02', 0.0, NULL)"
-            ),
-            {"no": False},
-        )
-        connection.execute(
-            text("INSERT INTO events VALUES ('old', 1, '2026-01-01', 0.5, 'note', '{\"text\": \"hm\"}')")
-        )
-    with store.engine.begin() as connection:
-        migrate(connection, "head")
-    row = store.get("old")
-    assert (row.state, row.host, row.version, row.attempt) == ("proposed", "local", "0", 0)
-    assert (row.plant_time_s, row.request) == (12.5, {"start": "relay"})
-    assert row.result == FiveStageResult(method="five-stage", new_gains=GainsView.of(Gains(2.0)))
-    assert [event.data for event in store.events("old")] == [{"text": "hm"}]
-    assert [job.id for job in store.unfinished()] == ["cut"]
-    with pytest.raises(Busy):  # the index that holds it has come through
-        store.create("A", {}, "me", False)
-    store.move("cut", JobState.INTERRUPTED)
-    store.create("A", {}, "me", False)
-
-
 def test_one_active_job_per_loop_holds_in_the_database_itself(store: Store) -> None:
     store.create("A", {}, "me", False)
     copy = (
-        "INSERT INTO jobs (id, loop, state, dry_run, request, requested_by, created_at, plant_time_s)"
-        " SELECT 'x', loop, 'running', dry_run, request, requested_by, created_at, 0 FROM jobs"
+        "INSERT INTO jobs (id, loop, state, dry_run, request, by, created_at, plant_time_s)"
+        " SELECT 'x', loop, 'running', dry_run, request, by, created_at, 0 FROM jobs"
     )
     with store.engine.connect() as connection, pytest.raises(IntegrityError):
         connection.execute(text(copy))

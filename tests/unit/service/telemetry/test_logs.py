@@ -23,7 +23,7 @@ def entry(message: str, **fields: object) -> logging.LogRecord:
     return record
 
 
-@pytest.mark.parametrize("field", ["path", "who", "loop", "job"])
+@pytest.mark.parametrize("field", ["path", "key", "loop", "job"])
 @pytest.mark.parametrize("character", [*ENDS_A_LINE, *HIDDEN])
 def test_a_field_stays_on_its_line(field: str, character: str) -> None:
     line = Lines().format(entry("request", **{field: f"/x{character}2026-01-01T00:00:00.000Z info forged"}))

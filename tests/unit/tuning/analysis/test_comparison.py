@@ -31,7 +31,7 @@ Ku, Pu = ultimate_point(PLANT)
 
 
 def by_fast(old: Gains, Ms: float = 1.6, plant: Model = PLANT, **options: bool) -> Comparison:
-    """The design of fast on the model beside the old gains."""
+    """The design of fast on the model beside the previous gains."""
     wished = FastOptions(Ms=Ms, **options)
     facts = Facts(SAMPLE_S, 20.0, 0.0, 100.0, 2.0, old)
     best = designed_on(plant, wished.spec(), 0.0)
@@ -45,7 +45,7 @@ def by_rule(method: str, old: Gains) -> Comparison:
 
 def own(method: str) -> Gains:
     """The gains that the method itself gives this plant."""
-    return by_fast(Gains(0.1, 20.0)).after.gains if method == "fast" else by_rule(method, Gains(0.1, 20.0)).after.gains
+    return by_fast(Gains(0.1, 20.0)).new.gains if method == "fast" else by_rule(method, Gains(0.1, 20.0)).new.gains
 
 
 def beside(method: str, old: Gains) -> Comparison:
@@ -69,21 +69,21 @@ def test_sluggish_gains_and_gains_that_swing_are_worth_a_change(method: str) -> 
     sluggish, swings = beside(method, Gains(0.1 * Ku, 3.0 * Pu)), beside(method, Gains(0.85 * Ku, Pu))
     assert sluggish.gain and "% less integral error" in sluggish.verdict and "J falls by" in sluggish.verdict
     assert swings.gain and swings.verdict.startswith("The present gains ")
-    assert swings.before.Ms is not None and swings.after.Ms is not None and swings.before.Ms > 2.0 * swings.after.Ms
+    assert swings.previous.Ms is not None and swings.new.Ms is not None and swings.previous.Ms > 2.0 * swings.new.Ms
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_gains_that_are_not_stable_on_the_model_are_worth_a_change(method: str) -> None:
     found = beside(method, Gains(1.3 * Ku, Pu))
-    assert found.gain and not found.before.stable and found.J_before is None
+    assert found.gain and not found.previous.stable and found.J_previous is None
     assert found.verdict.startswith("The present gains are not stable on the model found")
 
 
 def test_robustness_that_is_asked_for_is_a_gain_whatever_it_costs() -> None:
     present = own("fast")  # Ms 1.6
     found = by_fast(present, Ms=1.3)
-    assert found.J_before is not None and found.J_after is not None
-    assert found.gain and found.J_after > found.J_before
+    assert found.J_previous is not None and found.J_new is not None
+    assert found.gain and found.J_new > found.J_previous
     assert "Ms 1.60 (asked for: at most 1.30)" in found.verdict and "% more integral error" in found.verdict
 
 
@@ -94,10 +94,10 @@ def test_less_robustness_is_a_gain_where_it_makes_the_loop_faster() -> None:
 
 def test_a_present_loop_that_is_better_than_what_was_asked_for_is_kept() -> None:
     """Faster than the design and as robust, within 5 %: nothing that was asked for gets better."""
-    present = by_fast(Gains(0.1, 20.0), Ms=1.66).after.gains
+    present = by_fast(Gains(0.1, 20.0), Ms=1.66).new.gains
     found = by_fast(present, Ms=1.6)
-    assert found.before.Ms == pytest.approx(1.66, abs=0.01)
-    assert found.J_before is not None and found.J_after is not None and found.J_before < found.J_after
+    assert found.previous.Ms == pytest.approx(1.66, abs=0.01)
+    assert found.J_previous is not None and found.J_new is not None and found.J_previous < found.J_new
     assert not found.gain
 
 
@@ -182,4 +182,4 @@ def test_without_integral_action_an_offset_stays_and_is_no_figure() -> None:
     assert integrates.setpoint is not None and integrates.setpoint.IAE is not None
     assert math.isfinite(integrates.setpoint.IAE)
     better = by_fast(Gains(0.1 * Ku))
-    assert better.gain and better.J_before is None and "no longer a lasting integral error" in better.verdict
+    assert better.gain and better.J_previous is None and "no longer a lasting integral error" in better.verdict

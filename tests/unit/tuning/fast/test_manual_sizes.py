@@ -84,8 +84,8 @@ def test_the_next_pulse_grows_by_a_factor_at_most_and_waits_for_PV() -> None:
 def test_PV_may_go_to_its_limits_and_hardly_to_a_side_that_is_not_permitted() -> None:
     point = OperatingPoint(0.0, 50.0, 50.0, NOISE, 10.0)
     facts = {"sample_time_s": TS, "T95_s": 30.0, "mv_low": 0.0, "mv_high": 100.0, "sp_deviation": 2.0}
-    both = Facts(**facts, old_gains=Gains(1.0, 1.0), pv_low=49.0, pv_high=60.0)  # type: ignore[arg-type]
-    up = Facts(**facts, old_gains=Gains(1.0, 1.0), directions=Directions.UP)  # type: ignore[arg-type]
+    both = Facts(**facts, previous_gains=Gains(1.0, 1.0), pv_low=49.0, pv_high=60.0)  # type: ignore[arg-type]
+    up = Facts(**facts, previous_gains=Gains(1.0, 1.0), directions=Directions.UP)  # type: ignore[arg-type]
     assert pv_bounds(both, point, NOISE, 0.5) == PulseBounds(-1.0, 2.0, NOISE)
     assert pv_bounds(up, point, NOISE, 0.5) == PulseBounds(-1.0, 2.0, NOISE)
 

@@ -262,20 +262,20 @@ def test_the_comparison_says_what_was_asked_and_what_is_reached() -> None:
     slow = compared(Gains(0.4, 120.0), spec)
     assert slow.gain and "asked for: at most 100 s" in slow.verdict and "settling time" in slow.verdict
     assert (slow.settling_s_asked, slow.mv_peak_asked, slow.noise_gain_asked) == (100.0, 4.0, 3.0)
-    assert slow.after.setpoint is not None and (slow.after.setpoint.settling_s or 1e9) <= 100.01
-    assert slow.after.setpoint.mv_peak <= 4.0004
-    assert "settles within 100 s" in slow.criterion and slow.J_after == slow.after.Ms
+    assert slow.new.setpoint is not None and (slow.new.setpoint.settling_s or 1e9) <= 100.01
+    assert slow.new.setpoint.mv_peak <= 4.0004
+    assert "settles within 100 s" in slow.criterion and slow.J_new == slow.new.Ms
     jumpy = compared(Gains(3.0, 130.0, b=1.5), DesignSpec(mv_peak=2.0))
     assert jumpy.gain and "movement of MV of 4.85" in jumpy.verdict and "at most 2" in jumpy.verdict
 
 
 def test_gains_that_are_in_time_are_kept_unless_they_can_be_more_robust() -> None:
     spec = DesignSpec(settling_s=100.0)
-    own = compared(Gains(0.4, 120.0), spec).after.gains
+    own = compared(Gains(0.4, 120.0), spec).new.gains
     assert not compared(own, spec).gain
     fast = compared(required(design_of("heater", DesignSpec(settling_s=60.0))).gains, spec)
-    assert fast.gain and fast.before.Ms is not None and fast.after.Ms is not None
-    assert fast.after.Ms < 0.95 * fast.before.Ms and "J falls" not in fast.verdict
+    assert fast.gain and fast.previous.Ms is not None and fast.new.Ms is not None
+    assert fast.new.Ms < 0.95 * fast.previous.Ms and "J falls" not in fast.verdict
 
 
 def test_a_record_that_is_trusted_is_refused_with_what_is_possible() -> None:

@@ -164,7 +164,7 @@ def compared(old: Gains, aim: Aim, anyway: bool = False, Ms: float = 1.6) -> Com
 
 @pytest.mark.parametrize("aim", Aim)
 def test_gains_of_an_aim_are_no_gain_for_the_same_aim(aim: Aim) -> None:
-    own = compared(Gains(1.0, 200.0), aim).after.gains
+    own = compared(Gains(1.0, 200.0), aim).new.gains
     assert not compared(own, aim).gain
 
 
@@ -180,7 +180,7 @@ def test_a_loop_that_is_good_for_set_points_is_not_made_worse_for_them() -> None
     good = tune(HEATER, "simc").gains
     found = compared(good, Aim.BALANCED)
     assert not found.gain and "worse by" in found.verdict and "the present gains are kept" in found.verdict
-    assert found.J_before is not None and found.J_after is not None and found.J_after < found.J_before
+    assert found.J_previous is not None and found.J_new is not None and found.J_new < found.J_previous
     assert compared(good, Aim.LOAD).gain
     assert "proposed because that was asked for" in compared(good, Aim.BALANCED, anyway=True).verdict
     assert compared(Gains(1.5 * good.Kp, good.Ti), Aim.BALANCED).gain  # not as robust as asked

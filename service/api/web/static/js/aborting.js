@@ -27,13 +27,13 @@ export function forgetHeard() {
 
 /**
  * What is said of a job that is to stop; empty: it is not to stop. A gateway that says nothing may not have heard of it.
- * @param {{id: string, stopping: boolean, host: string, progress: number | null}} job of the live stream
+ * @param {{id: string, stopping: boolean, gateway: string, progress: number | null}} job of the live stream
  */
 export function stopWords(job) {
   const asked = aborting.value.get(job.id);
   if (job.stopping || asked === "heard") {
     const silent = isElsewhere(job) && job.progress === null;
-    return silent ? `asked to stop, gateway ${job.host} has not said that it has heard` : "stopping, the loop is being restored";
+    return silent ? `asked to stop, gateway ${job.gateway} has not confirmed it` : "stopping, the loop is being restored";
   }
   return asked ? "abort sent, no answer yet" : "";
 }
@@ -63,7 +63,7 @@ export function notAborted(problem) {
 }
 
 /**
- * Sends an abort of a job, or of a retune of many loops, and returns what it is after that.
+ * Sends an abort of a job, or of a batch, and returns what it is after that.
  * @param {{url: string}} what @returns {Promise<any>}
  */
 export async function sendAbort(what) {

@@ -1,25 +1,25 @@
 // @ts-check
-/** What is abnormal: what the service says, and that it says nothing, which this browser alone can know. */
+/** The active alarms: what the service says, and that it says nothing, which this browser alone can know. */
 import { computed } from "../vendor/signals-core.js";
 import { alarms, isSilent, now_s, silent_s } from "./state.js";
 
 /**
  * As GET /alarms has them.
- * @typedef {{id: string, level: 1 | 2 | 3, kind?: string, host?: string, subject: string, text: string, advice: string, since: string, loop: string | null,
- *   loops: string[], job: string | null, to_sign: boolean}} Alarm
+ * @typedef {{id: string, priority: 1 | 2 | 3, kind?: string, gateway?: string, subject: string, text: string, advice: string, since: string, loop: string | null,
+ *   loops: string[], job: string | null, unacknowledged: boolean}} Alarm
  */
 
 const silence = computed(() => {
   if (!isSilent.value) return null;
   return /** @type {Alarm} */ ({
-    id: "silent", level: 2, subject: "this browser", text: "No word from the service",
+    id: "silent", priority: 2, subject: "this browser", text: "Service offline",
     advice: "What is shown is old. The page asks again by itself.",
-    since: new Date(1000 * (now_s.peek() - silent_s.peek())).toISOString(), loop: null, loops: [], job: null, to_sign: false,
+    since: new Date(1000 * (now_s.peek() - silent_s.peek())).toISOString(), loop: null, loops: [], job: null, unacknowledged: false,
   });
 });
 
 /** The worst first; null: the service has not said yet. */
-export const abnormalNow = computed(() => {
+export const activeAlarms = computed(() => {
   const said = /** @type {Alarm[] | null} */ (alarms.value);
   if (silence.value) return [silence.value, ...(said ?? [])];
   return said;
@@ -29,6 +29,6 @@ export const abnormalNow = computed(() => {
 export const worstOf = computed(() => {
   /** @type {Map<string, Alarm>} */
   const found = new Map();
-  for (const each of abnormalNow.value ?? []) for (const tag of each.loops) if (!found.has(tag)) found.set(tag, each);
+  for (const each of activeAlarms.value ?? []) for (const tag of each.loops) if (!found.has(tag)) found.set(tag, each);
   return found;
 });

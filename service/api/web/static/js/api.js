@@ -131,7 +131,7 @@ export async function command(path, body, method = "POST", longest_s = LONGEST_S
     return (await request(method, path, body, stop.signal)).found;
   } catch (error) {
     if (!stop.signal.aborted) throw error;
-    throw new Problem(0, { reason: "not_answered", detail: `The service has not answered within ${longest_s} s: it is not known whether it has heard this.` });
+    throw new Problem(0, { reason: "not_answered", detail: `The service has not answered within ${longest_s} s: it is not known whether it has received this.` });
   } finally {
     clearTimeout(soon);
     clearTimeout(late);

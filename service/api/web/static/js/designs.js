@@ -7,7 +7,7 @@ import { ask } from "./api.js";
  * @typedef {{horizon_s: number, pv: number[]}} StepCurve PV after a unit step, at times evenly spaced
  * @typedef {{setpoint: StepCurve, load: StepCurve, nyquist_re: number[], nyquist_im: number[]}} Curves
  * @typedef {{ms: number, gains: any, uncertainty: number | null, performance: any, beside: string | null, curves: Curves | null}} Design
- * @typedef {{designs: Design[], before: any, after: any, before_curves: Curves | null, after_curves: Curves | null, after_beside: string | null}} Found
+ * @typedef {{designs: Design[], previous: any, new: any, previous_curves: Curves | null, new_curves: Curves | null, new_beside: string | null}} Found
  */
 
 /** @type {Map<string, {found: import("../vendor/signals-core.js").Signal<Found | null>, state: import("../vendor/signals-core.js").Signal<"" | "asked" | "done">}>} */

@@ -8,8 +8,8 @@ import { service } from "./state.js";
 /** As GET /gateways has them, by name; empty: not asked yet. */
 const gateways = signal(/** @type {Map<string, any>} */ (new Map()));
 
-/** Whether another gateway than the one that answers has the loop. @param {{host: string}} loop */
-export const isElsewhere = (loop) => service.value !== null && service.value.host !== loop.host;
+/** Whether another gateway than the one that answers has the loop. @param {{gateway: string}} loop */
+export const isElsewhere = (loop) => service.value !== null && service.value.gateway !== loop.gateway;
 
 /** Asks which gateways there are. */
 export async function refreshGateways() {
@@ -21,9 +21,9 @@ export async function refreshGateways() {
   }
 }
 
-/** The name of a loop's gateway, as a link to its page of the loop where its URL is known. @param {{host: string, tag: string}} loop */
+/** The name of a loop's gateway, as a link to its page of the loop where its URL is known. @param {{gateway: string, tag: string}} loop */
 export function GatewayName(loop) {
-  const url = gateways.value.get(loop.host)?.url;
-  const name = `gateway ${loop.host}`;
+  const url = gateways.value.get(loop.gateway)?.url;
+  const name = `gateway ${loop.gateway}`;
   return url ? html`<a href=${`${url}/ui/loops/${encodeURIComponent(loop.tag)}`}>${name}</a>` : name;
 }

@@ -10,7 +10,7 @@ import { beginPalette } from "./palette.js";
 import { beginRouting, decoded, go, path } from "./router.js";
 import { jobs, may, refreshLoops, refreshSession } from "./state.js";
 import { stream } from "./stream.js";
-import { AbnormalView } from "./views/abnormal.js";
+import { AlarmsView } from "./views/alarms.js";
 import { Banner, Bar, Dock, dockLoop } from "./views/frame.js";
 import { JobView } from "./views/job.js";
 import { JobsView } from "./views/jobs.js";
@@ -18,7 +18,7 @@ import { KeysView, keysShown } from "./views/keys.js";
 import { LogView } from "./views/log.js";
 import { LoopView } from "./views/loop.js";
 import { LoopsView } from "./views/loops.js";
-import { RetunesView } from "./views/retunes.js";
+import { BatchesView } from "./views/batches.js";
 import { SignIn } from "./views/signin.js";
 
 function View() {
@@ -27,8 +27,8 @@ function View() {
   if (part[2] === "loops" && part[3]) return html`<${LoopView} key=${`loop ${part[3]}`} tag=${part[3]} />`;
   if (part[2] === "jobs" && part[3]) return html`<${JobView} key=${`job ${part[3]}`} id=${part[3]} />`;
   if (part[2] === "jobs") return html`<${JobsView} key="jobs" />`;
-  if (part[2] === "retunes") return html`<${RetunesView} key="retunes" id=${part[3] ?? ""} />`;
-  if (part[2] === "alarms") return html`<${AbnormalView} key="alarms" />`;
+  if (part[2] === "batches") return html`<${BatchesView} key="batches" id=${part[3] ?? ""} />`;
+  if (part[2] === "alarms") return html`<${AlarmsView} key="alarms" />`;
   if (part[2] === "log") return html`<${LogView} key="log" />`;
   return html`<${LoopsView} key="loops" />`;
 }

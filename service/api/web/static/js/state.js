@@ -6,7 +6,7 @@ import { ask, askAll, csrf } from "./api.js";
 /** Who is signed in: name, scope (read, operate, admin), whether keys are asked for. null: not known yet. */
 export const session = signal(/** @type {{name: string, scope: string, keys: boolean} | null} */ (null));
 /** The service that answers: its name, its version. */
-export const service = signal(/** @type {{host: string, version: string} | null} */ (null));
+export const service = signal(/** @type {{gateway: string, version: string} | null} */ (null));
 /** Another version than the one this page was loaded from. */
 export const newerVersion = signal(false);
 
@@ -36,10 +36,10 @@ export function forgetRows() {
   });
 }
 
-export const buses = signal(/** @type {{host: string, bus: string, up: boolean | null, why: string | null}[]} */ ([]));
+export const buses = signal(/** @type {{gateway: string, bus: string, up: boolean | null, why: string | null}[]} */ ([]));
 /** Live jobs. */
 export const jobs = signal(/** @type {any[]} */ ([]));
-/** What is abnormal, as the service says, the worst first; null: it has not said yet. */
+/** The active alarms, as the service says, the worst first; null: it has not said yet. */
 export const alarms = signal(/** @type {any[] | null} */ (null));
 
 /** The present, wall time of the service, s, renewed each second. */

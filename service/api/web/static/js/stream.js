@@ -98,7 +98,7 @@ class Stream {
       });
     on("hello", (found) => {
       if (service.value && service.value.version !== found.version) newerVersion.value = true;
-      else service.value = { host: found.host, version: found.version };
+      else service.value = { gateway: found.gateway, version: found.version };
       setClock(found.now_s);
       if (!this.away) return;
       this.away = false;

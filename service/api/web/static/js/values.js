@@ -13,8 +13,8 @@ const NONE = { pv: null, sp: null, mv: null, mode: null, old: false, age_s: null
 /** Nothing of a service that is silent. @param {any} row of the live stream, null: none has come @param {boolean} silent @returns {Values} */
 export function valuesOf(row, silent) {
   if (!row || silent) return NONE;
-  const { pv, sp, mv, mode } = row.not_heard !== null && row.last ? row.last : row;
-  return { pv, sp, mv, mode, old: row.not_heard !== null, age_s: row.age_s };
+  const { pv, sp, mv, mode } = row.no_data !== null && row.last ? row.last : row;
+  return { pv, sp, mv, mode, old: row.no_data !== null, age_s: row.age_s };
 }
 
 /** How old values are that are old, in words; empty: they are present ones, or there are none. @param {Values} values */

@@ -4,19 +4,19 @@ import { fixed, known, significant, unit, withUnit, duration, ms, msError } from
 
 /** @type {Record<string, [name: string, what: string]>} */
 const STAGES = {
-  preflight: ["At rest?", "Is the loop at rest, and how large is the noise?"],
+  preflight: ["Steady-state check", "Is the loop at rest, and how large is the noise?"],
   settle: ["Settling", "The loop comes to rest first"],
-  pulses: ["Pulses", "The set-point is pulsed under the present gains, until what would be proposed is certain"],
-  manual: ["Manual pulses", "The manual output is pulsed, until what would be proposed is certain"],
-  relay: ["Relay", "MV is switched up and down until what would be proposed is certain"],
+  pulses: ["Set-point pulses", "The set-point is pulsed under the present gains, until what would be proposed is certain"],
+  manual: ["Manual-output pulses", "The manual output is pulsed, until what would be proposed is certain"],
+  relay: ["Relay test", "MV is switched up and down until what would be proposed is certain"],
   design: ["Model and gains", "A model is fitted to the record, and gains are designed on it"],
-  verify: ["Step", "The set-point steps under the new gains"],
-  redesign: ["Whole record", "The model is fitted anew to all that was recorded"],
-  baseline: ["Step before", "The set-point steps under the old gains"],
+  verify: ["Set-point step, new gains", "The set-point steps under the new gains"],
+  redesign: ["Final model", "The model is fitted anew to all that was recorded"],
+  baseline: ["Set-point step, previous gains", "The set-point steps under the previous gains"],
   ultimate: ["Ultimate gain", "The gain at which the loop oscillates is sought"],
-  zn_pi: ["First PI", "The set-point steps under a first PI"],
-  estimate: ["Model", "A model is found from the step"],
-  optimise: ["Gains", "The gains are computed on the model"],
+  zn_pi: ["Ziegler-Nichols PI", "The set-point steps under a Ziegler-Nichols PI"],
+  estimate: ["FOPDT estimate", "A model of first order with dead time is estimated from the step"],
+  optimise: ["Optimisation", "The gains are computed on the model"],
 };
 /** @param {string | null | undefined} stage */
 export const stageName = (stage) => (stage ? (STAGES[stage]?.[0] ?? stage.replaceAll("_", " ")) : "");
@@ -70,7 +70,7 @@ export function weight(gains) {
 export function markName(marks, n) {
   const name = stageName(marks[n].stage);
   const before = marks[n].stage === "verify" && n > 0 ? { relay: "the relay", pulses: "the pulses" }[marks[n - 1].stage === "design" ? (marks[n - 2]?.stage ?? "") : marks[n - 1].stage] : undefined;
-  return before ? `${name}, from where ${before} left PV` : name;
+  return before ? `Set-point step, from where ${before} left PV` : name;
 }
 
 /** The set-point weight that was on the loop, where that of the gains proposed is larger and was not. @param {any} job @returns {number | null} */
@@ -96,15 +96,15 @@ const REASONS = {
 /** @param {string | null | undefined} reason */
 export const reasonWords = (reason) => (reason ? (REASONS[reason] ?? reason.replaceAll("_", " ")) : "");
 
-/** What became of a decision that was asked at another gateway than the loop's. @param {any} request @param {string} host the loop's gateway */
-export function decisionRequestWords(request, host) {
+/** What became of a decision that was asked at another gateway than the loop's. @param {any} request @param {string} gateway the loop's */
+export function decisionRequestWords(request, gateway) {
   const what = `${request.what === "accept" ? "Accepting" : "Rolling back"}, asked by ${request.by} at gateway ${request.gateway}`;
   switch (request.state) {
-    case "waiting": return `${what}: gateway ${host} has not begun it yet.`;
-    case "under_way": return `${what}: gateway ${host} is at it.`;
+    case "waiting": return `${what}: gateway ${gateway} has not begun it yet.`;
+    case "under_way": return `${what}: gateway ${gateway} is at it.`;
     case "refused": return `${what}, was not done: ${request.detail ?? "an error there"}.`;
     case "cut_off": return `${what}, was cut off: whether the gains were written is not known. Look at the gains in effect, then decide again.`;
-    default: return `${what}, was not done: gateway ${host} did not answer in time, and will not do it any more.`;
+    default: return `${what}, was not done: gateway ${gateway} did not answer in time, and will not do it any more.`;
   }
 }
 
@@ -112,15 +112,15 @@ export function decisionRequestWords(request, host) {
 export function headline(job) {
   const why = reasonWords(job.reason);
   switch (job.state) {
-    case "queued": return "Waits for its turn";
-    case "running": return job.stopping ? "Stopping, the loop is being restored" : "Under test";
-    case "proposed": return job.superseded_by ? "Proposed, not decided, a later test came" : "New gains are proposed";
+    case "queued": return "Queued";
+    case "running": return job.stopping ? "Aborting, the loop is being restored" : "Under test";
+    case "proposed": return job.superseded_by ? "Proposed, not decided; a later test came" : "New gains are proposed";
     case "accepted": return "Accepted";
-    case "rolled_back": return "Rolled back to the old gains";
-    case "no_gain": return "The loop is tuned as well as asked already";
+    case "rolled_back": return "Rolled back to the previous gains";
+    case "no_gain": return "No improvement: the loop is tuned as well as asked";
     case "rehearsed": return "Rehearsed: gains found without a test of the loop";
-    case "refused": return `No result to trust: ${why}`;
-    case "aborted": return `Stopped: ${why}`;
+    case "refused": return `Refused: ${why}`;
+    case "aborted": return `Aborted: ${why}`;
     case "failed": return `Failed: ${why}`;
     case "interrupted": return `Interrupted: ${why || "the service ended in the middle"}`;
     default: return String(job.state).replaceAll("_", " ");
@@ -130,13 +130,13 @@ export function headline(job) {
 /** A state in a table. @param {any} job */
 export function stateWords(job) {
   switch (job.state) {
-    case "proposed": return job.superseded_by ? "not decided, a later test came" : "decision waits";
+    case "proposed": return job.superseded_by ? "not decided, a later test came" : "awaiting decision";
     case "rolled_back": return "rolled back";
-    case "no_gain": return "tuned already";
+    case "no_gain": return "no improvement";
     case "refused": return `refused: ${reasonWords(job.reason)}`;
-    case "aborted": return `stopped: ${reasonWords(job.reason)}`;
+    case "aborted": return `aborted: ${reasonWords(job.reason)}`;
     case "failed": return `failed: ${reasonWords(job.reason)}`;
-    case "queued": return "waits for its turn";
+    case "queued": return "queued";
     case "running": return "under test";
     default: return String(job.state).replaceAll("_", " ");
   }

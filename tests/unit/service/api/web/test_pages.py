@@ -133,7 +133,7 @@ def test_where_keys_are_asked_for_the_page_comes_without_one(service: Service) -
 
 def test_the_page_learns_who_is_asking(service: Service, client: TestClient) -> None:
     found = client.get("/session").json()
-    assert (found["name"], found["scope"], found["keys"], found["host"]) == ("local", "admin", False, "local")
+    assert (found["name"], found["scope"], found["keys"], found["gateway"]) == ("local", "admin", False, "local")
     keyring = Keyring(service.store.engine)
     _, key = keyring.create("control room", Scope.OPERATE)
     with TestClient(app_of(service.jobs, Policy(keyring))) as keyed:

@@ -25,7 +25,7 @@ def drawn_axes(old: Gains, new: Gains, step: float | None = 0.1) -> list[Axes]:
     job: Any = SimpleNamespace(
         loop="TIC-1",
         model=SimpleNamespace(process_model=lambda: PLANT),
-        old_gains=GainsView.of(old),
+        previous_gains=GainsView.of(old),
         new_gains=GainsView.of(new),
         verification=None if step is None else SimpleNamespace(step=step),
         sample_time_s=None,

@@ -16,7 +16,7 @@ const GAP = 16;
 /** @param {{loop: any, detail: any, job: any, latest: boolean, quiet: boolean, onChanged: (job: any) => void}} props */
 export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
   const designed = (job.method === "fast" || job.method === "setpoint") && !job.dry_run;
-  const tested = job.chosen.Ms ?? job.predicted?.Ms ?? Number(job.request.ms ?? 1.6);
+  const tested = job.design.Ms ?? job.predicted?.Ms ?? Number(job.request.Ms ?? 1.6);
   const [ms, setMs] = useState(/** @type {number} */ (tested));
   const { found: foundSignal, state } = designsOf(job.url);
   const found = foundSignal.value;
@@ -34,38 +34,38 @@ export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
     void fillDesigns(job.url, stop.signal);
     return () => stop.abort();
   }, [job.id]);
-  const old = job.comparison?.before ?? found?.before ?? null;
+  const old = job.comparison?.previous ?? found?.previous ?? null;
   /** @type {import("../designs.js").Design} */
   const own = {
     ms: tested, gains: job.new_gains, uncertainty: job.evidence?.uncertainty ?? null,
-    performance: job.comparison?.after ?? found?.after ?? null, curves: found?.after_curves ?? null,
-    beside: found?.after_beside ?? null,
+    performance: job.comparison?.new ?? found?.new ?? null, curves: found?.new_curves ?? null,
+    beside: found?.new_beside ?? null,
   };
   const designs = [...(designed ? (found?.designs ?? []).filter((each) => Math.abs(each.ms - tested) > 0.02) : []), own].sort((a, b) => a.ms - b.ms);
   const chosen = designs.find((each) => Math.abs(each.ms - ms) < 1e-9) ?? own;
   const atTested = chosen === own;
-  const size = Math.abs(job.verification?.step || job.after?.step || loop.sp_deviation);
+  const size = Math.abs(job.verification?.step || job.step_after?.step || loop.sp_deviation);
   const points = designs.filter((each) => each.performance?.load?.IAE > 0).map((each) => ({ ms: each.ms, IAE: each.performance.load.IAE }));
   const name = nameOf(job);
   const narrow = matchMedia("(max-width: 720px)").matches;
   const small = narrow ? width : (width - 2 * GAP) / 2.8;
-  const [before, after] = [found?.before_curves ?? null, chosen.curves];
+  const [before, after] = [found?.previous_curves ?? null, chosen.curves];
   const Ms = chosen.performance?.Ms ?? chosen.ms;
   const decided = job.state === "accepted" || job.state === "rolled_back"; // its verdict speaks of the gains before as the present ones
   const verdict = atTested && !decided ? job.comparison?.verdict : chosen.beside;
 
   return html`<div class="card choice"><div class="body"><div ref=${curve}>
-      ${designed && html`<div class="curve" key="curve"><div class="split"><span class="title">Faster or more robust</span><span>Ms <b>${msText(ms)}</b> <span class="quiet">${atTested ? testedWords(job) : "not tested"}</span></span></div>
+      ${designed && html`<div class="curve" key="curve"><div class="split"><span class="title">Robustness</span><span>Ms <b>${msText(ms)}</b> <span class="quiet">${atTested ? testedWords(job) : "not tested"}</span></span></div>
         ${Curve(width, points, ms, tested, old?.Ms ?? null, old?.stable ? (old.load?.IAE ?? null) : null)}
         <input type="range" min=${designs[0].ms} max=${designs[designs.length - 1].ms} step="0.01" value=${ms} disabled=${designs.length < 2} aria-label="Ms" aria-valuetext=${`Ms ${msText(ms)}, ${atTested ? testedWords(job) : "not tested"}`}
           onInput=${(/** @type {any} */ e) => setMs(nearest(designs, Number(e.target.value)))}
           onDblClick=${() => setMs(tested)} onKeyDown=${(/** @type {any} */ e) => slide(e, tested, designs, setMs)} />
         <div class="ends"><span>${msText(designs[0].ms)} robust</span>${asked && html`<span class="quiet">asking for the designs…</span>`}<span>fast ${msText(designs[designs.length - 1].ms)}</span></div></div>`}
       ${after && html`<div class="small-plots" key="plots">
-        <figure><figcaption><b>Set-point step</b> PV, ${unit(loop.pv_unit)}, by the model</figcaption>${StepPlot(small, before?.setpoint ?? null, after.setpoint, size, true, "Set-point step before and after")}</figure>
-        <figure><figcaption><b>Load step of ${LOAD_PCT} %</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(small, before?.load ?? null, after.load, LOAD_PCT, false, "Load step before and after")}</figure>
+        <figure><figcaption><b>Set-point step</b> PV, ${unit(loop.pv_unit)}, by the model</figcaption>${StepPlot(small, before?.setpoint ?? null, after.setpoint, size, true, "Set-point step, previous and new gains")}</figure>
+        <figure><figcaption><b>Load step of ${LOAD_PCT} %</b> PV, ${unit(loop.pv_unit)}</figcaption>${StepPlot(small, before?.load ?? null, after.load, LOAD_PCT, false, "Load step, previous and new gains")}</figure>
         <figure><figcaption><b>Distance from −1</b> Nyquist</figcaption>${NyquistPlot(narrow ? small : 0.8 * small, before, after, Ms)}</figure></div>
-        <div class="legend" key="legend" style=${{ marginTop: "8px" }}><span class="old">before</span><span class="new">${atTested ? name : "chosen"}</span></div>`}
+        <div class="legend" key="legend" style=${{ marginTop: "8px" }}><span class="old">previous</span><span class="new">${atTested ? name : "chosen"}</span></div>`}
       ${!after && html`<p class="quiet" key="no-plots">${asked ? "asking for the curves…" : state.value === "done" ? "The service has no curves for these gains." : ""}</p>`}
     </div><div>${Table(loop, job, chosen, old, atTested, size, found)}${!job.reason && verdict && html`<p class="note" key="verdict">${verdict}</p>`}</div></div>
     ${!quiet && html`<${Decide} key="decide" loop=${loop} detail=${detail} job=${job} latest=${latest} ms=${ms} tested=${tested} atTested=${atTested} back=${() => setMs(tested)} onChanged=${onChanged} />`}
@@ -74,7 +74,7 @@ export function Choice({ loop, detail, job, latest, quiet, onChanged }) {
 
 /** What of the gains found was on the loop. @param {any} job */
 function testedWords(job) {
-  if (!job.verification && !job.after) return "as asked";
+  if (!job.verification && !job.step_after) return "as asked";
   const b = untriedWeight(job);
   return b === null ? "as asked and tested" : `as asked; tested with b ${significant(b, 3)}`;
 }
@@ -108,14 +108,14 @@ const atMost = (value) => (known(value) ? `, asked: at most ${significant(Number
 /** @param {any} loop @param {any} job @param {import("../designs.js").Design} chosen @param {any} was performance before @param {boolean} atTested @param {number} size @param {import("../designs.js").Found | null} found */
 function Table(loop, job, chosen, was, atTested, size, found) {
   const u = unit(loop.pv_unit);
-  const old = job.old_gains;
+  const old = job.previous_gains;
   const gains = chosen.gains;
   const a = was ?? {};
   const b = chosen.performance ?? {};
   const stable = was?.stable ?? true;
   const uncertain = chosen.uncertainty;
   const load = (/** @type {any} */ of) => (known(of.load?.IAE) ? LOAD_PCT * of.load.IAE : null);
-  const [dm, dmAfter] = [a.delay_margin_s ?? found?.before?.delay_margin_s, b.delay_margin_s ?? (atTested ? found?.after?.delay_margin_s : null)];
+  const [dm, dmAfter] = [a.delay_margin_s ?? found?.previous?.delay_margin_s, b.delay_margin_s ?? (atTested ? found?.new?.delay_margin_s : null)];
   /** @type {[any, string, number | null | undefined, number | null | undefined, (v: any) => string][]} */
   const rows = [
     [html`Gain Kp <small>%/${u}</small>`, "kp", old?.Kp, gains.Kp, significant],
@@ -123,18 +123,18 @@ function Table(loop, job, chosen, was, atTested, size, found) {
     ...(old?.Td || gains.Td ? /** @type {any[]} */ ([[html`Derivative time Td <small>s</small>`, "td", old?.Td, gains.Td, significant]]) : []),
     ...(weight(old) || weight(gains) ? /** @type {any[]} */ ([[html`Set-point weight b`, "b", old?.b, gains.b, (/** @type {any} */ v) => significant(v, 3)]]) : []),
     [html`Overshoot <small>%</small>`, "os", stable ? a.overshoot_pct : null, b.overshoot_pct, (v) => fixed(v, 0)],
-    [html`Settled within 5 % <small>s${atMost(atTested ? job.comparison?.settling_s_asked : null)}</small>`, "settle", stable ? a.setpoint?.settling_s : null, b.setpoint?.settling_s, (v) => significant(v, 2)],
-    ...(known(job.comparison?.mv_peak_asked) ? /** @type {any[]} */ ([[html`MV moved after a step <small>%/${u}${atMost(job.comparison.mv_peak_asked)}</small>`, "mv", stable ? a.setpoint?.mv_peak : null, b.setpoint?.mv_peak, significant]]) : []),
+    [html`Settling time (5 %) <small>s${atMost(atTested ? job.comparison?.settling_s_asked : null)}</small>`, "settle", stable ? a.setpoint?.settling_s : null, b.setpoint?.settling_s, (v) => significant(v, 2)],
+    ...(known(job.comparison?.mv_peak_asked) ? /** @type {any[]} */ ([[html`Largest output move <small>%/${u}${atMost(job.comparison.mv_peak_asked)}</small>`, "mv", stable ? a.setpoint?.mv_peak : null, b.setpoint?.mv_peak, significant]]) : []),
     [html`Load of ${LOAD_PCT} %, IAE <small>${u} s</small>`, "iae", stable ? load(a) : null, load(b), (v) => significant(v, 3)],
     [html`Largest sensitivity Ms ${known(uncertain) && html`<small>± ${msError(uncertain)}</small>`}`, "ms", stable ? a.Ms : null, b.Ms, msText],
-    [html`The plant's gain may grow`, "gm", stable ? a.GM : null, b.GM, (v) => (known(v) ? `× ${fixed(v, 2)}` : "–")],
-    [html`Its dead time may grow by <small>s</small>`, "dm", stable ? dm : null, dmAfter, (v) => significant(v, 3)],
+    [html`Gain margin`, "gm", stable ? a.GM : null, b.GM, (v) => (known(v) ? `× ${fixed(v, 2)}` : "–")],
+    [html`Delay margin <small>s</small>`, "dm", stable ? dm : null, dmAfter, (v) => significant(v, 3)],
     [html`Phase margin <small>°</small>`, "pm", stable ? a.PM_deg : null, b.PM_deg, (v) => fixed(v, 0)],
   ];
-  return html`<table class="figures" key="table"><caption class="hidden-words">Before and after, for a set-point step of ${size} ${u}</caption>
-    <thead><tr><th><span class="hidden-words">Figure</span></th><th class="num">before</th><th class="num">${atTested ? nameOf(job) : "chosen"}</th><th><span class="hidden-words">Change</span></th></tr></thead>
+  return html`<table class="figures" key="table"><caption class="hidden-words">Previous and new gains, for a set-point step of ${size} ${u}</caption>
+    <thead><tr><th><span class="hidden-words">Figure</span></th><th class="num">previous</th><th class="num">${atTested ? nameOf(job) : "chosen"}</th><th><span class="hidden-words">Change</span></th></tr></thead>
     <tbody>${rows.map(([name, key, x, y, text]) => html`<tr key=${key}><td>${name}</td><td class="num">${key === "ti" && x === 0 ? "off" : text(x)}</td><td class="num after">${text(y)}</td><td class="num quiet">${key === "os" ? "" : change(x, y)}</td></tr>`)}</tbody></table>
-    ${!stable && html`<p class="note" key="unstable">With the gains before, the loop is not stable on this model.</p>`}`;
+    ${!stable && html`<p class="note" key="unstable">With the previous gains, the loop is not stable on this model.</p>`}`;
 }
 
 /** @param {{loop: any, detail: any, job: any, latest: boolean, ms: number, tested: number, atTested: boolean, back: () => void, onChanged: (job: any) => void}} props */
@@ -188,16 +188,16 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   }, [pending, job.url]);
   const tryIt = () =>
     send(async () => {
-      const answer = await ask(`${job.url}/alternatives?ms=${ms.toFixed(2)}`);
+      const answer = await ask(`${job.url}/alternatives?Ms=${ms.toFixed(2)}`);
       const body = answer.methods[0]?.retune;
       if (!body) throw new Error(answer.methods[0]?.detail ?? "The service has no gains for this Ms.");
-      return command(`/loops/${encodeURIComponent(loop.tag)}/retune`, { ...body, requested_by: signature.value.trim() });
+      return command(`/loops/${encodeURIComponent(loop.tag)}/retune`, { ...body, by: signature.value.trim() });
     });
   const dead = sending || isSilent.value;
-  const gains = asking === "rollback" ? job.old_gains : job.new_gains;
+  const gains = asking === "rollback" ? job.previous_gains : job.new_gains;
   const written = gains && `Kp ${significant(gains.Kp)} %/${unit(loop.pv_unit)}, Ti ${significant(gains.Ti)} s${gains.Td ? `, Td ${significant(gains.Td)} s` : ""}${weight(gains)}`;
   const where = `${loop.tag}, node ${loop.controller_node.toString(16)}h channel ${loop.channel}`;
-  const Signed = (/** @type {string} */ action, /** @type {() => void} */ go) => html`<span class="ask" key="ask"><label key="by">Signed <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && signature.value.trim() && !dead) go(); }} /></label>
+  const Signed = (/** @type {string} */ action, /** @type {() => void} */ go) => html`<span class="ask" key="ask"><label key="by">Your name <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && signature.value.trim() && !dead) go(); }} /></label>
     <button key="cancel" onClick=${close}>Cancel</button><button key="go" class="main" disabled=${dead || !signature.value.trim()} onClick=${go}>${action}</button></span>`;
   const mode = rowOf(loop.tag).value?.mode;
   const noTrialIn = mode === "manual" ? "in manual" : mode === "off" ? "off" : "";
@@ -205,19 +205,19 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   let inside = null;
   if (job.dry_run) inside = html`<span class="say">A rehearsal: nothing was moved, and there is nothing to accept.</span>`;
   else if (loop.locked) inside = html`<span class="say">Locked by ${loop.locked.by}: no decision until it is unlocked.</span>`;
-  else if (!may.operate.value) inside = html`<span class="say">${job.state === "proposed" ? "The loop runs on its old gains. To accept the new ones needs the scope operate." : ""}</span>`;
-  else if (pending) inside = html`<span class="say" role="status">${decisionRequestWords(request, loop.host)}</span>`;
-  else if (asking === "accept") inside = html`<span class="say">Write <b>${written}</b> into ${where}, for good.</span><label key="itself" class="itself"><input type="checkbox" checked=${byItself} onChange=${(/** @type {any} */ e) => setByItself(e.target.checked)} /> Put the old gains back by itself if, while the loop is watched, PV leaves its limits or an oscillation grows</label>${Signed(`Write to ${loop.tag}`, () => send(() => command(`${job.url}/accept`, { ...by(), roll_back_by_itself: byItself })))}`;
-  else if (asking === "keep") inside = html`<span class="say">Keep the old gains; the proposal is declined.</span>${Signed("Keep the old gains", () => send(() => command(`${job.url}/rollback`, by())))}`;
-  else if (asking === "rollback") inside = html`<span class="say">Write the old gains, <b>${written}</b>, back into ${where}.</span>${Signed(`Roll ${loop.tag} back`, () => send(() => command(`${job.url}/rollback`, by())))}`;
+  else if (!may.operate.value) inside = html`<span class="say">${job.state === "proposed" ? "The loop runs on its previous gains. To accept the new ones needs the scope operate." : ""}</span>`;
+  else if (pending) inside = html`<span class="say" role="status">${decisionRequestWords(request, loop.gateway)}</span>`;
+  else if (asking === "accept") inside = html`<span class="say">Write <b>${written}</b> into ${where}, for good.</span><label key="itself" class="itself"><input type="checkbox" checked=${byItself} onChange=${(/** @type {any} */ e) => setByItself(e.target.checked)} /> Put the previous gains back automatically if, while the loop is monitored, PV leaves its limits or an oscillation grows</label>${Signed(`Write to ${loop.tag}`, () => send(() => command(`${job.url}/accept`, { ...by(), auto_rollback: byItself })))}`;
+  else if (asking === "keep") inside = html`<span class="say">Keep the previous gains; the proposal is declined.</span>${Signed("Keep the previous gains", () => send(() => command(`${job.url}/rollback`, by())))}`;
+  else if (asking === "rollback") inside = html`<span class="say">Write the previous gains, <b>${written}</b>, back into ${where}.</span>${Signed(`Roll ${loop.tag} back`, () => send(() => command(`${job.url}/rollback`, by())))}`;
   else if (noTrialIn && (!atTested || asking === "try")) inside = html`<span class="say">These gains have not been on the loop, and cannot be tried: a trial steps the set-point, and the loop is ${noTrialIn}. Put it in automatic to try them.</span>${backButton}`;
   else if (asking === "try") inside = html`<span class="say">A trial listens, steps the set-point by <b>${withUnit(fixed(loop.sp_deviation, pvDecimals(loop.pv_limits)), loop.pv_unit)}</b> under the gains for Ms ${msText(ms)}, and ends as a proposal. No relay.</span>${Signed(`Try Ms ${msText(ms)} on ${loop.tag}`, tryIt)}`;
   else if (!atTested) inside = html`<span class="say">These gains have not been on the loop.</span>${backButton}<button key="try" class="main" disabled=${dead} data-opens="try" onClick=${() => open("try")}>Try Ms ${msText(ms)} on ${loop.tag}…</button>`;
-  else if (job.state === "proposed" && latest) inside = html`<span class="say">The loop runs on its old gains until you accept.</span><button key="keep" disabled=${dead} data-opens="keep" onClick=${() => open("keep")}>Keep the old gains…</button><button key="accept" class="main" disabled=${dead} data-opens="accept" onClick=${() => open("accept")}>Accept the new gains…</button>`;
-  else if (job.state === "accepted" && latest) inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>${detail?.live ? html`; in effect now: Kp ${significant(detail.live.gains.Kp)}, Ti ${significant(detail.live.gains.Ti)} s${weight(detail.live.gains)}` : ""}.</span><button key="rollback" disabled=${dead} data-opens="rollback" onClick=${() => open("rollback")}>Roll back to the old gains…</button>`;
-  else if (job.state === "rolled_back") inside = html`<span class="say">The loop runs on its old gains${job.decided ? `; decided by ${job.decided.by}` : ""}.</span>`;
+  else if (job.state === "proposed" && latest) inside = html`<span class="say">The loop runs on its previous gains until you accept.</span><button key="keep" disabled=${dead} data-opens="keep" onClick=${() => open("keep")}>Keep the previous gains…</button><button key="accept" class="main" disabled=${dead} data-opens="accept" onClick=${() => open("accept")}>Accept the new gains…</button>`;
+  else if (job.state === "accepted" && latest) inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>${detail?.live ? html`; in effect now: Kp ${significant(detail.live.gains.Kp)}, Ti ${significant(detail.live.gains.Ti)} s${weight(detail.live.gains)}` : ""}.</span><button key="rollback" disabled=${dead} data-opens="rollback" onClick=${() => open("rollback")}>Roll back to the previous gains…</button>`;
+  else if (job.state === "rolled_back") inside = html`<span class="say">The loop runs on its previous gains${job.decided ? `; decided by ${job.decided.by}` : ""}.</span>`;
   else if (job.state === "proposed") inside = html`<span class="say">Not decided; a later test came.</span>`;
   else if (job.state === "accepted") inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>; a later test came.</span>`;
   if (!inside && !problem) return null;
-  return html`<div class="decide" ref=${group} role="group" aria-label="Decision">${inside}${request && !pending && !asking && html`<p class="quiet" key="request">${decisionRequestWords(request, loop.host)}</p>`}${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice ?? ""}</span></p>`}</div>`;
+  return html`<div class="decide" ref=${group} role="group" aria-label="Decision">${inside}${request && !pending && !asking && html`<p class="quiet" key="request">${decisionRequestWords(request, loop.gateway)}</p>`}${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice ?? ""}</span></p>`}</div>`;
 }

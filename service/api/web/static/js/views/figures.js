@@ -21,13 +21,13 @@ export function Curve(width, points, ms, tested, msBefore, iaeBefore) {
   const part = b && a && b.ms > a.ms ? Math.min(1, Math.max(0, (ms - a.ms) / (b.ms - a.ms))) : 1;
   const iae = a && b ? Math.exp(Math.log(a.IAE) + part * Math.log(b.IAE / a.IAE)) : 1;
   const inside = msBefore !== null && iaeBefore !== null && msBefore >= low && msBefore <= high;
-  return html`<svg viewBox=${`0 0 ${width} 130`} role="img" aria-label="How soon a load is made good, for each Ms">
+  return html`<svg viewBox=${`0 0 ${width} 130`} role="img" aria-label="Disturbance rejection for each Ms">
     ${points.length > 1 && html`<path key="area" d=${`${line}L${x(high)} 126L${x(low)} 126Z`} class="f-band" /><path key="line" d=${line} class="s-new" />`}
     <path d=${`M${x(tested)} 8V126`} class="s-pale" />
     ${inside && html`<circle key="before" cx=${x(/** @type {number} */ (msBefore))} cy=${y(/** @type {number} */ (iaeBefore))} r="5" class="s-ink" />`}
     ${points.length > 0 && html`<circle key="dot" cx=${x(ms)} cy=${y(iae)} r="6" class="f-new" />`}
-    <text x="12" y="14">a load is made good sooner ↑</text>
-    ${msBefore !== null && !inside && html`<text key="off" x=${msBefore > high ? width - 8 : 8} y="124" text-anchor=${msBefore > high ? "end" : "start"}>before: Ms ${msText(msBefore)} ${msBefore > high ? "→" : "←"}</text>`}
+    <text x="12" y="14">faster disturbance rejection ↑</text>
+    ${msBefore !== null && !inside && html`<text key="off" x=${msBefore > high ? width - 8 : 8} y="124" text-anchor=${msBefore > high ? "end" : "start"}>previous: Ms ${msText(msBefore)} ${msBefore > high ? "→" : "←"}</text>`}
   </svg>`;
 }
 

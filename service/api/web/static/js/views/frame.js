@@ -2,7 +2,7 @@
 /** What stands on every view: the bar, the banner, the dock with Abort. */
 import { signal } from "../../vendor/signals-core.js";
 import { abortJob, abortError, stopWords } from "../aborting.js";
-import { abnormalNow } from "../alarms.js";
+import { activeAlarms } from "../alarms.js";
 import { command, signedOut } from "../api.js";
 import { html } from "../html.js";
 import { duration } from "../numbers.js";
@@ -13,14 +13,14 @@ import { AlarmSymbol } from "../symbols.js";
 import { stageName } from "../words.js";
 import { keysShown } from "./keys.js";
 
-const PLACES = [["/ui/", "Loops"], ["/ui/jobs", "Jobs"], ["/ui/retunes", "Retunes"]];
+const PLACES = [["/ui/", "Loops"], ["/ui/jobs", "Jobs"], ["/ui/batches", "Batches"]];
 
 export function Bar() {
   const at = path.value;
   const inside = (/** @type {string} */ to) => (to === "/ui/" ? at === "/ui/" || at.startsWith("/ui/loops") : at.startsWith(to));
-  const all = abnormalNow.value;
-  const levels = /** @type {const} */ ([1, 2, 3]).map((level) => [level, (all ?? []).filter((each) => each.level === level).length]);
-  const some = levels.filter(([, count]) => count);
+  const all = activeAlarms.value;
+  const counts = /** @type {const} */ ([1, 2, 3]).map((priority) => [priority, (all ?? []).filter((each) => each.priority === priority).length]);
+  const some = counts.filter(([, count]) => count);
   return html`<header class="bar">
     <a class="mark" href="/ui/" aria-label="Loopwright, to the loops"><svg viewBox="0 0 32 18" aria-hidden="true"><path d="M1 15h7c4 0 4-12 9-12 3 0 3 5 6 5h8" /></svg><span>Loopwright</span></a>
     <nav aria-label="Views">
@@ -28,10 +28,10 @@ export function Bar() {
       ${may.admin.value && html`<a key="log" href="/ui/log" aria-current=${inside("/ui/log") ? "page" : undefined}>Log</a>`}
     </nav>
     <div class="right">
-      <a href="/ui/alarms"><span class="hidden-words">${!all ? "What is abnormal" : some.length ? `${all.length} abnormal: ` : ""}</span>
-        ${some.length ? some.map(([level, count]) => html`<span key=${level} class="count">${AlarmSymbol(/** @type {1|2|3} */ (level))} ${count}</span>`) : html`<svg class="calm-sign" viewBox="0 0 20 20" aria-hidden="true"><path d="M10 2.5 18 17H2Z" class="s-line" /></svg><span class="calmness">${all ? "Nothing abnormal" : "…"}</span>`}
+      <a href="/ui/alarms"><span class="hidden-words">${!all ? "Alarms" : some.length ? `${all.length} active ${all.length === 1 ? "alarm" : "alarms"}: ` : ""}</span>
+        ${some.length ? some.map(([priority, count]) => html`<span key=${priority} class="count">${AlarmSymbol(/** @type {1|2|3} */ (priority))} ${count}</span>`) : html`<svg class="calm-sign" viewBox="0 0 20 20" aria-hidden="true"><path d="M10 2.5 18 17H2Z" class="s-line" /></svg><span class="calmness">${all ? "No active alarms" : "…"}</span>`}
       </a>
-      <span class="who">${session.value && html`${service.value && service.value.host !== session.value.name ? `${service.value.host} · ` : ""}<b>${session.value.name}</b> · ${session.value.scope}`}</span>
+      <span class="who">${session.value && html`${service.value && service.value.gateway !== session.value.name ? `${service.value.gateway} · ` : ""}<b>${session.value.name}</b> · ${session.value.scope}`}</span>
       <button class="plain" onClick=${() => (keysShown.value = !keysShown.value)} aria-label="Keys" aria-keyshortcuts="?" title="keys of this page">?</button>
       <button class="plain" onClick=${cyclePalette} aria-label=${`Colours: ${palette.value}`}>◑ <span class="who">${palette.value}</span></button>
       ${signOutError.value && html`<span key="error" role="alert">${signOutError.value}</span>`}
@@ -57,7 +57,7 @@ async function signOut() {
 export function Banner() {
   if (isSilent.value) {
     return html`<div class="banner" role="alert" key="silent">${AlarmSymbol(2)}
-      <span><b>No word from the service for ${silent_s.value} s.</b> What is shown is old. If the service has ended, it has ended its tests too, or the controllers do so by themselves, and the loops are as before; if only this screen has lost it, tests go on.</span></div>`;
+      <span><b>Service offline for ${silent_s.value} s.</b> What is shown is old. If the service has ended, it has ended its tests too, or the controllers do so by themselves, and the loops are as before; if only this screen has lost it, tests go on.</span></div>`;
   }
   if (newerVersion.value) {
     return html`<div class="banner calm" role="status" key="newer"><span>Loopwright was updated.</span><button onClick=${() => location.reload()}>Reload</button></div>`;
@@ -89,7 +89,7 @@ function Cell({ job, more }) {
   const stopping = stop !== "";
   const error = stopping ? undefined : abortError.value.get(job.id); // an answer that was late or lost: the stream says it
   const left = isSilent.value ? "" : stopping ? "" : job.remaining_plant_time_s === null ? "" : `${duration(job.remaining_plant_time_s)} left`;
-  const stage = stopping ? stop : job.state === "queued" ? "waits for its turn" : stageName(job.stage) || "begins";
+  const stage = stopping ? stop : job.state === "queued" ? "queued" : stageName(job.stage) || "begins";
   return html`<div class="cell">
     <a class="tag" href=${loopPath(job.loop)}>${job.loop}</a>
     <span class="stage" aria-live="polite">${stage}</span>

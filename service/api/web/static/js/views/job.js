@@ -49,7 +49,7 @@ function OfRemoved({ job }) {
   return html`<div><div class="looptitle" key="title"><h1 class="tag">${job.loop}</h1><span class="where">job ${job.id}${job.dry_run ? " · rehearsal" : ""}</span></div>
     <p class="refusal" key="removed">The loop ${job.loop} is not configured any more: its job can be read, and nothing be decided about it here.</p>
     <section key="result" aria-label="Result"><div class="headline"><div><h2>${headline(job)}</h2></div>
-      <p class="facts">${when(job.ended_at ?? job.created_at)} · ${job.requested_by} · ${methodName(job.method)} · ${duration(job.plant_time_s)} of plant time<br />
+      <p class="facts">${when(job.ended_at ?? job.created_at)} · ${job.by} · ${methodName(job.method)} · ${duration(job.plant_time_s)} of plant time<br />
         <a href=${`${job.url}/report`} target="_blank">Report</a><a href=${`${job.url}/samples?format=csv`} target="_blank">Samples</a></p></div>
       ${job.reason && html`<div class="card" key="why"><p>${sentence(job.detail)}</p><p class="advice">${job.advice}</p></div>`}</section></div>`;
 }

@@ -53,15 +53,15 @@ export function JobsView() {
   };
   return html`<div><div class="pagehead" key="head"><h1>Jobs</h1>
       <label class="check">Loop <select value=${loop} onChange=${(/** @type {any} */ e) => setLoop(e.target.value)}><option value="">all</option>${[...(loops.value?.keys() ?? [])].sort().map((tag) => html`<option key=${tag} value=${tag}>${tag}</option>`)}</select></label>
-      <label class="check">Result <select value=${state} onChange=${(/** @type {any} */ e) => setState(e.target.value)}>${STATES.map((each) => html`<option key=${each} value=${each}>${each ? (each === "proposed" ? "waits for a decision" : each.replaceAll("_", " ")) : "all"}</option>`)}</select></label></div>
+      <label class="check">Result <select value=${state} onChange=${(/** @type {any} */ e) => setState(e.target.value)}>${STATES.map((each) => html`<option key=${each} value=${each}>${each ? (each === "proposed" ? "awaiting decision" : each.replaceAll("_", " ")) : "all"}</option>`)}</select></label></div>
     ${problem && html`<p class="refusal" role="alert" key="problem">${problem}</p>`}
     ${!rows ? html`<p class="calm" role="status" key="wait">Asking for the jobs…</p>` : !rows.length ? html`<p class="calm" key="none">There are no such jobs.</p>` : html`<div class="table jobs" key="table"><table>
       <thead><tr><th>Date</th><th>Loop</th><th class="c-by">Asked by</th><th class="c-method">Procedure</th><th>Result</th><th>Kp</th><th>Ti, s</th><th>Ms</th><th class="c-decided">Decided</th></tr></thead>
       <tbody>${rows.map((job) => html`<tr class="row" key=${job.id} onClick=${(/** @type {MouseEvent} */ e) => { if (!(/** @type {Element} */ (e.target).closest("a"))) go(jobPath(job.url)); }}>
-        <td><a href=${jobPath(job.url)}>${when(job.started_at ?? job.created_at)}</a></td><td><a class="tag" href=${loopPath(job.loop)}>${job.loop}</a></td><td class="c-by">${job.requested_by}</td>
+        <td><a href=${jobPath(job.url)}>${when(job.started_at ?? job.created_at)}</a></td><td><a class="tag" href=${loopPath(job.loop)}>${job.loop}</a></td><td class="c-by">${job.by}</td>
         <td class="c-method">${methodName(job.method)}${job.dry_run ? ", rehearsal" : ""}</td><td>${job.state === "proposed" && !job.superseded_by ? html`<b>${stateWords(job)}</b>` : stateWords(job)}${job.state === "running" ? `, ${stageName(job.stage)}` : ""}</td>
-        ${Arrow(job.old_gains?.Kp, job.new_gains?.Kp)}${Arrow(job.old_gains?.Ti, job.new_gains?.Ti)}
-        <td>${known(job.comparison?.after?.Ms) ? Change(ms(job.comparison.before?.Ms), ms(job.comparison.after.Ms)) : Change("", known(job.predicted?.Ms) ? ms(job.predicted.Ms) : "")}</td>
+        ${Arrow(job.previous_gains?.Kp, job.new_gains?.Kp)}${Arrow(job.previous_gains?.Ti, job.new_gains?.Ti)}
+        <td>${known(job.comparison?.new?.Ms) ? Change(ms(job.comparison.previous?.Ms), ms(job.comparison.new.Ms)) : Change("", known(job.predicted?.Ms) ? ms(job.predicted.Ms) : "")}</td>
         <td class="c-decided">${job.decided ? html`${job.decided.by} <span class="quiet">${when(job.decided.at)}</span>` : ""}</td></tr>`)}</tbody></table></div>`}
     ${next && html`<p class="foot" key="more"><button onClick=${more}>More</button></p>`}</div>`;
 }

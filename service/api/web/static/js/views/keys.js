@@ -9,7 +9,7 @@ const KEYS = [
   ["Ctrl+.", "aborts the test in the dock"],
   ["/", "find, in Loops"],
   ["j k Enter", "next row, previous row, open"],
-  ["g l, g j, g a", "Loops, Jobs, Abnormal"],
+  ["g l, g j, g a", "Loops, Jobs, Alarms"],
   ["1 … 4, t", "windows of the trend, the test"],
   ["arrows, Home, End", "the slider, from one design to the next"],
   ["Esc", "closes a form or a question; the slider goes back"],

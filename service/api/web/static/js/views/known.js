@@ -12,7 +12,7 @@ export function Known({ loop, detail }) {
   // What was found is of the gains that were in effect then.
   useEffect(() => setFound(null), [loop.last_job?.url, loop.last_job?.state, loop.gains_differ]);
   const look = async () => {
-    setState("Looking at what was heard…");
+    setState("Identifying from the history…");
     try {
       setFound(await ask(`/loops/${encodeURIComponent(loop.tag)}/observation`));
       setState("");
@@ -22,13 +22,13 @@ export function Known({ loop, detail }) {
     }
   };
   const k = found?.knowledge ?? detail?.knowledge;
-  return html`<section class="card" aria-label="What is known of the plant"><h2 class="title" key="t">Known of the plant</h2>
+  return html`<section class="card" aria-label="Process model"><h2 class="title" key="t">Process model</h2>
     ${k ? html`<div key="k"><dl class="pairs"><dt>Ms now</dt><dd>${known(k.Ms) ? `${ms(k.Ms)}${known(k.uncertainty) ? ` ± ${msError(k.uncertainty)}` : ""}` : "–"}</dd>
       <dt>dead time</dt><dd>${withUnit(significant(k.model.dead_time_s, 3), "s")}</dd>
       ${known(k.changes) && html`<dt key="c">from</dt><dd key="cv">${k.changes} ${k.changes === 1 ? "change" : "changes"}</dd>`}
-      ${k.agreeing > 0 && html`<dt key="a">other tests agree</dt><dd key="av">${k.agreeing}</dd>`}</dl><p class="note">${k.text.replaceAll("+-", "± ")}</p></div>` : html`<p class="quiet" key="none">nothing yet</p>`}
+      ${k.consistent > 0 && html`<dt key="a">consistent with</dt><dd key="av">${k.consistent}</dd>`}</dl><p class="note">${k.text.replaceAll("+-", "± ")}</p></div>` : html`<p class="quiet" key="none">nothing yet</p>`}
     ${found && html`<div key="found"><p class="note">${found.known}<br />${found.detail}${found.advice ? html` <b>${found.advice}</b>` : ""}</p>
       <p class="quiet">${found.changes_used.length} set-point changes used, ${found.changes_dropped.length} left out, ${found.loads.length} loads found; last ${found.changes_used.length ? when(new Date(found.changes_used.at(-1).at_s * 1000).toISOString()) : "–"}.</p></div>`}
-    <p class="foot" key="foot"><span class="left" role="status">${state}</span><button onClick=${look}>Look at normal operation</button></p>
+    <p class="foot" key="foot"><span class="left" role="status">${state}</span><button onClick=${look}>Identify from operation</button></p>
   </section>`;
 }

@@ -1,7 +1,7 @@
 // @ts-check
 /** One loop: its face, trend, gains, limits, what is known of its plant, its tests; the test under way; the latest result. */
 import { useEffect, useRef, useState } from "../../vendor/hooks.js";
-import { abnormalNow } from "../alarms.js";
+import { activeAlarms } from "../alarms.js";
 import { ask, askPage, command } from "../api.js";
 import { GatewayName, isElsewhere, refreshGateways } from "../gateways.js";
 import { html } from "../html.js";
@@ -15,7 +15,7 @@ import { dockLoop } from "./frame.js";
 import { Known } from "./known.js";
 import { Result } from "./result.js";
 import { RetuneForm } from "./retune.js";
-import { asking, SignOffButton, SignOffQuestion } from "./signoff.js";
+import { asking, AcknowledgeButton, AcknowledgeQuestion } from "./acknowledge.js";
 import { Trend } from "./trend.js";
 import { UnderTest } from "./undertest.js";
 
@@ -33,7 +33,7 @@ export function LoopView({ tag }) {
   const [open, setOpen] = useState(/** @type {boolean | null} */ (null));
   const job = jobs.value.find((each) => each.loop === tag && !each.dry_run) ?? null;
   const row = rowOf(tag).value;
-  const mark = `${row?.job ?? ""} ${row?.last_job?.url ?? ""} ${row?.last_job?.state ?? ""} ${loop?.locked?.since ?? ""} ${row?.not_heard ? "not heard" : ""}`;
+  const mark = `${row?.job ?? ""} ${row?.last_job?.url ?? ""} ${row?.last_job?.state ?? ""} ${loop?.locked?.since ?? ""} ${row?.no_data ? "not heard" : ""}`;
 
   useEffect(() => {
     document.title = `${tag} · Loopwright`;
@@ -89,7 +89,7 @@ export function LoopView({ tag }) {
     }, () => {});
   };
   const formOpen = !job && (open ?? (result === null && may.operate.value));
-  const mine = (abnormalNow.value ?? []).filter((each) => each.loops.includes(tag));
+  const mine = (activeAlarms.value ?? []).filter((each) => each.loops.includes(tag));
   // A test that has just ended is not shown with the result of the one before it.
   const isLatest = !row?.last_job || row.last_job.url === result?.url;
   const height = TREND_PX;
@@ -99,10 +99,10 @@ export function LoopView({ tag }) {
       ${!job && !formOpen && result !== undefined && may.operate.value && html`<button key="retune" id="retune" onClick=${() => setOpen(true)}>Retune…</button>`}
       ${!may.operate.value && html`<span key="may" class="quiet">Your key may read. To retune it needs the scope operate.</span>`}
     </div>
-    ${mine.map((each) => html`<div class="abnormal" key=${each.id}>${AlarmSymbol(each.level)}<span><b>${each.text}.</b> <span class="quiet">${each.advice}</span></span>${SignOffButton(each)}
-      ${asking.value === each.id && html`<${SignOffQuestion} key="question" alarm=${each} />`}</div>`)}
-    ${elsewhere && row?.not_heard && !isSilent.value && !mine.some((each) => each.kind === "gateway_silent") && html`<p class="refusal" key="gateway" role="status"><b>${row.not_heard}.</b></p>`}
-    ${detail?.not_confirmed_home && html`<p class="refusal" key="home">${sentence(detail.not_confirmed_home.advice)}</p>`}
+    ${mine.map((each) => html`<div class="loop-alarm" key=${each.id}>${AlarmSymbol(each.priority)}<span><b>${each.text}.</b> <span class="quiet">${each.advice}</span></span>${AcknowledgeButton(each)}
+      ${asking.value === each.id && html`<${AcknowledgeQuestion} key="question" alarm=${each} />`}</div>`)}
+    ${elsewhere && row?.no_data && !isSilent.value && !mine.some((each) => each.kind === "gateway_offline") && html`<p class="refusal" key="gateway" role="status"><b>${row.no_data}.</b></p>`}
+    ${detail?.restore_unconfirmed && html`<p class="refusal" key="home">${sentence(detail.restore_unconfirmed.advice)}</p>`}
     ${loop.locked && html`<p class="refusal" key="lock">Locked by ${loop.locked.by} since ${when(loop.locked.since)}: ${loop.locked.reason}. Tests and decisions wait until it is unlocked. ${may.operate.value && html`<${Unlock} key="unlock" tag=${tag} />`}</p>`}
     <div class="loop" key="loop">
       <aside key="aside"><${Face} key="face" loop=${loop} />${Settings(loop, detail)}<${Known} key="known" loop=${loop} detail=${detail} />${Tests(tests)}</aside>
@@ -143,7 +143,7 @@ function Unlock({ tag }) {
     if (e.key === "Escape") setAsking(false);
   };
   if (!asking) return html`<button class="plain" onClick=${() => setAsking(true)}>Unlock…</button>`;
-  return html`<span class="ask" role="group" aria-label=${`Unlock ${tag}`}><label>Signed <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${keys} /></label>
+  return html`<span class="ask" role="group" aria-label=${`Unlock ${tag}`}><label>Your name <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${keys} /></label>
     <button onClick=${() => setAsking(false)}>Cancel</button><button class="main" disabled=${dead} onClick=${send}>Unlock ${tag}</button>${problem && html` <span role="alert">${problem}</span>`}</span>`;
 }
 
@@ -173,10 +173,10 @@ function Settings(loop, detail) {
       <dt>action</dt><dd>${live.reverse_acting ? "reverse" : "direct"}</dd><dt>sampled</dt><dd>every ${period(live.sample_time_s)}</dd></dl>`
     : html`<p key="none" class="quiet">${detail?.live_error ? `${sentence(detail.live_error.detail)} ${detail.live_error.advice}` : detail ? "not known here" : "reading…"}</p>`}
     ${loop.gains_differ && loop.accepted && html`<p class="note" key="differ">Accepted last: Kp ${significant(loop.accepted.gains.Kp)}, Ti ${significant(loop.accepted.gains.Ti)} s${weight(loop.accepted.gains)}, by ${loop.accepted.by}, ${when(loop.accepted.at)}.</p>`}
-    <h2 class="title" key="t2">Permitted</h2>
+    <h2 class="title" key="t2">Limits</h2>
     <dl class="pairs" key="limits"><dt>PV</dt><dd>${fixed(loop.pv_limits.low, decimals)} … ${fixed(loop.pv_limits.high, decimals)} <span class="quiet">${u}</span></dd>
       <dt>MV</dt><dd>${significant(loop.mv_limits.low, 3)} … ${significant(loop.mv_limits.high, 3)} <span class="quiet">%</span></dd>
-      <dt>SP step</dt><dd>${{ both: "±", up: "+", down: "−" }[/** @type {"both" | "up" | "down"} */ (loop.test.directions)]} ${fixed(loop.sp_deviation, decimals)} <span class="quiet">${u}</span></dd><dt>test by</dt><dd>${loop.test.excitations.map((/** @type {string} */ each) => ({ setpoint: "set-point", manual: "manual output" }[each] ?? each)).join(", ")}</dd></dl>
+      <dt>SP step</dt><dd>${{ both: "±", up: "+", down: "−" }[/** @type {"both" | "up" | "down"} */ (loop.test.directions)]} ${fixed(loop.sp_deviation, decimals)} <span class="quiet">${u}</span></dd><dt>excitation</dt><dd>${loop.test.excitations.map((/** @type {string} */ each) => ({ setpoint: "set-point", manual: "manual output" }[each] ?? each)).join(", ")}</dd></dl>
     ${loop.notes && html`<p class="note" key="notes">${loop.notes}</p>`}
   </section>`;
 }
@@ -185,5 +185,5 @@ function Settings(loop, detail) {
 function Tests(tests) {
   return html`<section class="card tests" key="tests"><h2 class="title">Earlier tests</h2>
     ${tests.length ? html`<ul class="tests">${tests.slice(0, 6).map((each) => html`<li key=${each.id}><a href=${jobPath(each.url)}>${when(each.ended_at ?? each.created_at)}</a>
-      <small>${each.dry_run ? "rehearsal · " : ""}${stateWords(each)}${known(each.request.ms) ? ` · Ms ${ms(each.request.ms)}` : ""}</small></li>`)}</ul>` : html`<p class="quiet">none yet</p>`}</section>`;
+      <small>${each.dry_run ? "rehearsal · " : ""}${stateWords(each)}${known(each.request.Ms) ? ` · Ms ${ms(each.request.Ms)}` : ""}</small></li>`)}</ul>` : html`<p class="quiet">none yet</p>`}</section>`;
 }

@@ -1,5 +1,5 @@
 // @ts-check
-/** All loops: PV between its limits, what is under test, what waits for a decision, what is abnormal. */
+/** All loops: PV between its limits, what is under test, what awaits a decision, what is in alarm. */
 import { computed, signal } from "../../vendor/signals-core.js";
 import { useEffect } from "../../vendor/hooks.js";
 import { worstOf } from "../alarms.js";
@@ -80,7 +80,7 @@ export function LoopsView() {
         onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && listed.value.length === 1) go(loopPath(listed.value[0].tag)); }} />
       ${areas.length > 1 && html`<span class="segments" role="group" aria-label="Area">
         ${["", ...areas].map((name) => html`<button key=${name} aria-pressed=${String(area.value === name)} onClick=${() => (area.value = name)}>${name || "All areas"}</button>`)}</span>`}
-      <label class="check"><input type="checkbox" checked=${onlyLook.value} onChange=${(/** @type {any} */ e) => (onlyLook.value = e.target.checked)} /> only what needs a look</label>
+      <label class="check"><input type="checkbox" checked=${onlyLook.value} onChange=${(/** @type {any} */ e) => (onlyLook.value = e.target.checked)} /> needs attention</label>
       <${Sentence} />
     </div>
     ${shown.length ? html`<div class="table loops" key="table"><table>
@@ -88,8 +88,8 @@ export function LoopsView() {
       ${[...groups].map(([name, members]) => html`<tbody key=${name}>
         ${groups.size > 1 || name ? html`<tr class="area" key="area"><th colspan="11" scope="rowgroup">${name || "No area"}</th></tr>` : null}
         ${members.map((loop) => html`<${Row} key=${loop.tag} loop=${loop} />`)}</tbody>`)}
-    </table></div>` : html`<p class="calm" key="none">${onlyLook.value && !find.value ? "Nothing needs a look." : "No loop is found by this."}</p>`}
-    ${buses.value.filter((each) => each.up === false).map((each) => html`<p class="busline" key=${`${each.host} ${each.bus}`}>${AlarmSymbol(2)}<span>Bus <b>${each.bus}</b>${isElsewhere(each) ? ` of gateway ${each.host}` : ""} is down, opening it again every 2 s. <span class="quiet">${sentence(each.why ?? "")}</span></span></p>`)}
+    </table></div>` : html`<p class="calm" key="none">${onlyLook.value && !find.value ? "No loop needs attention." : "No loop is found by this."}</p>`}
+    ${buses.value.filter((each) => each.up === false).map((each) => html`<p class="busline" key=${`${each.gateway} ${each.bus}`}>${AlarmSymbol(2)}<span>Bus <b>${each.bus}</b>${isElsewhere(each) ? ` of gateway ${each.gateway}` : ""} is down, opening it again every 2 s. <span class="quiet">${sentence(each.why ?? "")}</span></span></p>`)}
   </div>`;
 }
 
@@ -98,8 +98,8 @@ function Sentence() {
   const parts = [
     [all.length, all.length === 1 ? "loop" : "loops"],
     [jobByLoop.value.size, "under test"],
-    [all.filter(waits).length, all.filter(waits).length === 1 ? "waits for a decision" : "wait for a decision"],
-    [worstOf.value.size, "abnormal"],
+    [all.filter(waits).length, "awaiting decision"],
+    [worstOf.value.size, "in alarm"],
   ].filter(([count], n) => n === 0 || count);
   return html`<span class="sentence">${parts.map(([count, words], n) => html`${n ? " · " : ""}<b>${count}</b> ${words}`)}</span>`;
 }
@@ -113,7 +113,7 @@ function Row({ loop }) {
   const job = jobByLoop.value.get(loop.tag);
   const outside = pv !== null && !old && (pv < loop.pv_limits.low || pv > loop.pv_limits.high);
   return html`<tr class=${`row ${atRow.value === loop.tag ? "at" : ""} ${old ? "old" : ""}`} data-tag=${loop.tag} onClick=${(/** @type {MouseEvent} */ e) => { if (!(/** @type {Element} */ (e.target).closest("a"))) go(loopPath(loop.tag)); }}>
-    <td class="sign">${alarm ? AlarmSymbol(alarm.level) : job ? TestSign() : waits(loop) ? DecisionSign() : null}</td>
+    <td class="sign">${alarm ? AlarmSymbol(alarm.priority) : job ? TestSign() : waits(loop) ? DecisionSign() : null}</td>
     <td class="name"><a class="tag" href=${loopPath(loop.tag)}>${loop.tag}</a><small>${alarm ? html`<b>${alarm.text.split(": ")[0]}</b>` : loop.description}</small></td>
     <td class="num"><span class=${`pvnum ${outside ? "outside" : ""}`}>${fixed(pv, decimals)}</span><span class="name-below">${unit(loop.pv_unit)}</span>${old && html`<small key="age" class="age">${ageWords(values)}</small>`}</td>
     <td class="unit">${unit(loop.pv_unit)}</td>
@@ -130,7 +130,7 @@ function Row({ loop }) {
 /** @param {any} loop @param {any} job */
 function Tuning(loop, job) {
   if (job) {
-    return html`<span class="tuning"><b>${job.stopping ? "stopping" : job.state === "queued" ? "waits for its turn" : stageName(job.stage) || "begins"}</b>${Progress(job.progress, job.stopping)}
+    return html`<span class="tuning"><b>${job.stopping ? "stopping" : job.state === "queued" ? "queued" : stageName(job.stage) || "begins"}</b>${Progress(job.progress, job.stopping)}
       <span>${isSilent.value || job.remaining_plant_time_s === null ? "" : duration(job.remaining_plant_time_s)}</span></span>`;
   }
   const last = loop.last_job;
@@ -138,10 +138,10 @@ function Tuning(loop, job) {
   if (loop.locked) return html`<span class="tuning">locked by ${loop.locked.by}</span>`;
   if (!last) return html`<span class="tuning quiet">not tuned yet</span>`;
   if (loop.gains_differ) return html`<span class="tuning">gains differ from the accepted</span>`;
-  if (last.state === "proposed") return html`<span class="tuning"><b>decision waits</b> ${at}</span>`;
+  if (last.state === "proposed") return html`<span class="tuning"><b>awaiting decision</b> ${at}</span>`;
   if (last.state === "accepted") return html`<span class="tuning">${known(loop.accepted?.ms) ? `Ms ${ms(loop.accepted.ms)}` : "accepted"} ${at}</span>`;
-  if (last.state === "rolled_back") return html`<span class="tuning">old gains in effect ${at}</span>`;
-  if (last.state === "no_gain") return html`<span class="tuning">tuned already ${at}</span>`;
+  if (last.state === "rolled_back") return html`<span class="tuning">previous gains in effect ${at}</span>`;
+  if (last.state === "no_gain") return html`<span class="tuning">no improvement ${at}</span>`;
   const word = last.state === "aborted" ? "stopped" : last.state;
   return html`<span class="tuning">${word}${last.reason ? `: ${reasonWords(last.reason)}` : ""} ${at}</span>`;
 }

@@ -78,7 +78,7 @@ export function Record({ loop, job }) {
       <span class="legend" aria-hidden="true"><span class=${record?.model ? "measured" : "pv"}>PV measured</span><span class="sp">SP</span>${record?.model && html`<span class="new">model</span>`}<span class="mv">MV</span></span></div>
     ${!record && html`<p class="quiet" key="words" role="status">${words}</p>`}
     ${record && html`<div key="plots"><span class="axis-name">PV, ${unit(loop.pv_unit)}</span><div class="plot" ref=${pv} role="img" aria-label="PV measured, set-point and model"></div>
-      ${record.model && html`<span key="n" class="axis-name">not explained, with the noise at rest (2 σ)</span><div key="p" class="plot" ref=${left} role="img" aria-label="What the model leaves"></div>`}
+      ${record.model && html`<span key="n" class="axis-name">residual, with the noise at rest (2 σ)</span><div key="p" class="plot" ref=${left} role="img" aria-label="What the model leaves"></div>`}
       <span class="axis-name">MV, %</span><div class="plot" ref=${mv} role="img" aria-label="MV"></div><p class="axis-name num">plant time since the test began</p></div>`}
   </section>`;
 }

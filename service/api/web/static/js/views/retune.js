@@ -15,7 +15,7 @@ const [SOON_MS, LATER_MS] = [5000, 30_000];
 
 /** @param {{loop: any, onClose: (() => void) | null, onStarted: (job: any) => void}} props */
 export function RetuneForm({ loop, onClose, onStarted }) {
-  const [form, setForm] = useState(/** @type {Record<string, any>} */ ({ method: "fast", ms: 1.6 }));
+  const [form, setForm] = useState(/** @type {Record<string, any>} */ ({ method: "fast", Ms: 1.6 }));
   const [more, setMore] = useState(false);
   const [methods, setMethods] = useState(/** @type {any[]} */ ([]));
   const [preview, setPreview] = useState(/** @type {any} */ (null));
@@ -26,7 +26,7 @@ export function RetuneForm({ loop, onClose, onStarted }) {
   const row = rowOf(loop.tag).value;
   const { body, bad } = bodyOf(form);
   const asked = JSON.stringify(body);
-  const situation = `${row?.mode} ${row?.not_heard ? "silent" : ""} ${loop.locked?.since ?? ""}`;
+  const situation = `${row?.mode} ${row?.no_data ? "silent" : ""} ${loop.locked?.since ?? ""}`;
 
   const inTheWay = !!unclear || !!preview?.obstacles.length;
   const problem = refused ?? unclear;
@@ -76,7 +76,7 @@ export function RetuneForm({ loop, onClose, onStarted }) {
     setSending(true);
     setRefused(null);
     try {
-      onStarted(await command(`/loops/${encodeURIComponent(loop.tag)}/retune`, { ...body, requested_by: signature.value.trim() }));
+      onStarted(await command(`/loops/${encodeURIComponent(loop.tag)}/retune`, { ...body, by: signature.value.trim() }));
     } catch (error) {
       setRefused(error);
       setSending(false);
@@ -85,14 +85,14 @@ export function RetuneForm({ loop, onClose, onStarted }) {
   const designed = form.method === "fast" || form.method === "setpoint";
   const obstacle = preview?.obstacles.find((/** @type {any} */ each) => !PASSING.includes(each.reason));
   const unsigned = !signature.value.trim();
-  const why = isSilent.value ? "The service is silent." : bad ? bad : obstacle ? "" : unsigned ? "Who signs?" : "";
+  const why = isSilent.value ? "The service is offline." : bad ? bad : obstacle ? "" : unsigned ? "Your name is missing." : "";
   const dead = sending || !!why || !!obstacle;
   const u = unit(loop.pv_unit);
   return html`<section class="card" aria-label="Retune" style=${{ marginTop: "16px" }}>
     <div class="split" key="top"><h2 class="title">Retune</h2>${onClose && html`<button class="plain" aria-label="Close the form" onClick=${onClose}>✕</button>`}</div>
     <div class="two" key="two"><div class="explain" aria-live="polite">${preview ? What(preview, loop) : html`<p class="quiet">Asking what would happen…</p>`}</div>
-      <div>${designed && html`<label key="ms" class="field"><span>Robustness asked for <b>Ms ${ms(Number(form.ms))}</b></span>
-        <input ref=${first} type="range" min="1.2" max="2" step="0.05" value=${form.ms} onInput=${set("ms")} aria-valuetext=${`Ms ${ms(Number(form.ms))}`} /></label>
+      <div>${designed && html`<label key="ms" class="field"><span>Robustness asked for <b>Ms ${ms(Number(form.Ms))}</b></span>
+        <input ref=${first} type="range" min="1.2" max="2" step="0.05" value=${form.Ms} onInput=${set("Ms")} aria-valuetext=${`Ms ${ms(Number(form.Ms))}`} /></label>
         <div class="ends" key="ends"><span>1.2 robust</span><span>1.6</span><span>fast 2.0</span></div>`}
         <button key="more" class="plain" aria-expanded=${String(more)} onClick=${() => setMore(!more)}>${more ? "Fewer options" : "More options"}</button></div></div>
     ${more && html`<div class="options" key="options">
@@ -103,17 +103,17 @@ export function RetuneForm({ loop, onClose, onStarted }) {
       ${Field("mv_low", "%", loop.mv_limits.low, form, set, problem)}${Field("mv_high", "%", loop.mv_limits.high, form, set, problem)}
       ${Field("pv_low", u, loop.pv_limits.low, form, set, problem)}${Field("pv_high", u, loop.pv_limits.high, form, set, problem)}
       ${Field("sp_deviation", u, loop.sp_deviation, form, set, problem)}
-      ${designed && html`<label class="check"><input type="checkbox" checked=${!!form.derivative} onChange=${set("derivative")} /> derivative, where it pays</label>`}
-      ${designed && html`<label class="field"><span>The best for</span><select class="wide" value=${form.aim ?? "balanced"} onChange=${set("aim")}>
+      ${designed && html`<label class="check"><input type="checkbox" checked=${!!form.derivative} onChange=${set("derivative")} /> allow derivative (PID)</label>`}
+      ${designed && html`<label class="field"><span>Tuning objective</span><select class="wide" value=${form.aim ?? "balanced"} onChange=${set("aim")}>
         <option value="balanced">set-point and load alike</option><option value="setpoint">set-point steps</option><option value="load">load disturbances</option><option value="no_overshoot">both, without overshoot</option></select></label>`}
       ${designed && Field("settling_s", "s", null, form, set, problem)}
       ${designed && Field("mv_peak", `% per ${u}`, null, form, set, problem)}
-      ${form.method === "fast" && html`<label class="check"><input type="checkbox" checked=${!!form.careful} onChange=${set("careful")} /> careful: six switches at least</label>`}
+      ${form.method === "fast" && html`<label class="field"><span>Relay switches, at least</span><select value=${form.min_switches ?? "4"} onChange=${set("min_switches")}>${["4", "6", "8", "10"].map((each) => html`<option key=${each} value=${each}>${each}</option>`)}</select></label>`}
       <label class="check"><input type="checkbox" checked=${!!form.dry_run} onChange=${set("dry_run")} /> rehearsal: computed in memory, nothing is moved</label>
     </div>`}
     ${preview?.obstacles.map((/** @type {any} */ each) => html`<div class="refusal" key=${each.reason}><p>${asNamed(each.detail)} <span class="advice">${each.advice}</span> ${each.job && html`<a href=${jobPath(each.job)}>to that job</a>`}</p></div>`)}
     ${problem && html`<div class="refusal" role="alert" key="problem"><p>${asNamed(problem.message)} <span class="advice">${problem.advice}</span> ${problem.job && html`<a href=${jobPath(problem.job)}>to that job</a>`}</p></div>`}
-    <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && !dead) void start(); }} /></label>
+    <div class="foot" key="foot"><label class="left">Your name <input type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && !dead) void start(); }} /></label>
       <span class="quiet" role="status">${why}</span>
       <button class="main" disabled=${dead} onClick=${start}>${form.dry_run ? "Rehearse" : "Retune"} ${loop.tag}</button></div>
   </section>`;
@@ -128,7 +128,7 @@ function Field(name, u, usual, form, set, problem) {
 /** How the form names the fields of a request. @type {Record<string, string>} */
 const LABELS = {
   amplitude_pct: "Relay up by", mv_low: "MV not below", mv_high: "MV not above", pv_low: "Abort below", pv_high: "Abort above",
-  sp_deviation: "SP step", settling_s: "Settled within 5 % in", mv_peak: "MV moved at most by",
+  sp_deviation: "SP step", settling_s: "Settling time (5 %), at most", mv_peak: "Largest output move",
 };
 
 /** A message of the service, with the fields named as the form names them. @param {string | null | undefined} text */
@@ -153,11 +153,11 @@ function bodyOf(form) {
     else if (value !== null) body[name] = value;
   }
   if (designed) {
-    body.ms = Number(form.ms);
+    body.Ms = Number(form.Ms);
     if (form.derivative) body.derivative = true;
     if (form.aim) body.aim = form.aim;
   }
-  if (form.method === "fast" && form.careful) body.careful = true;
+  if (form.method === "fast" && form.min_switches) body.min_switches = Number(form.min_switches);
   if (form.dry_run) body.dry_run = true;
   const bad = wrong.length ? `Not a number: ${wrong.map((each) => `“${each}”`).join(", ")}.` : "";
   return { body, bad };

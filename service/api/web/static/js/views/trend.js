@@ -191,7 +191,7 @@ export function Trend({ loop, job, height, onJob }) {
     };
     // The samples of another gateway do not come here: its values do, once a second.
     const leaveRow = rowOf(loop.tag).subscribe((row) => {
-      if (!row || row.not_heard !== null || row.age_s === null || !isElsewhere(loop)) return;
+      if (!row || row.no_data !== null || row.age_s === null || !isElsewhere(loop)) return;
       const at_s = now_s.peek() - row.age_s;
       const since_s = at_s - it.ring.last;
       if (since_s < SAME_S && since_s > -SET_BACK_S) return;

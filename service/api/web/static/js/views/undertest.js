@@ -12,13 +12,13 @@ export function UnderTest({ loop, live, job }) {
   const stop = stopWords(live);
   const stopping = stop !== "";
   return html`<section class="card undertest" id="under-test" tabindex="-1" aria-label="Under test">
-    <div class="split" key="top"><h2 class="title">${live.state === "queued" ? "Waits for its turn" : "Under test"}</h2>
+    <div class="split" key="top"><h2 class="title">${live.state === "queued" ? "Queued" : "Under test"}</h2>
       <span>${stopping ? stop : live.remaining_plant_time_s !== null && !isSilent.value ? html`about <b>${duration(live.remaining_plant_time_s)}</b> left <span class="quiet">of plant time, ${duration(live.plant_time_s)} so far</span>` : ""}</span></div>
     ${Progress(live.progress, stopping)}
     ${job ? Stages(job, loop.pv_unit, live.stage ?? "") : html`<p class="quiet" key="asking">Asking for the stages…</p>`}
     ${job?.attempts > 1 && html`<p class="note" key="resumed">Resumed after a restart of the service: the stages begin anew.</p>`}
     ${job?.notes.map((/** @type {string} */ note) => html`<p class="note" key=${note}>${sentence(note)}</p>`)}
-    <p class="quiet who-asked" key="who">Asked for by ${live.requested_by}.</p>
+    <p class="quiet who-asked" key="who">Asked for by ${live.by}.</p>
   </section>`;
 }
 

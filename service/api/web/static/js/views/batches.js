@@ -1,5 +1,5 @@
 // @ts-check
-/** Retunes of many loops: the list, one retune with its loops, the form. */
+/** Batches: the list, one batch with its loops, the form. */
 import { useEffect, useRef, useState } from "../../vendor/hooks.js";
 import { notAborted, sendAbort } from "../aborting.js";
 import { ask, askPage, askWith, command } from "../api.js";
@@ -12,11 +12,11 @@ import { reasonWords, stageName } from "../words.js";
 const AGAIN_MS = 5000;
 const [PAGE, MOST] = [50, 1000];
 
-/** Whether loops of a retune are still to come, or under test. @param {{state: string}} retune */
+/** Whether loops of a batch are still to come, or under test. @param {{state: string}} retune */
 const isGoing = ({ state }) => state === "running" || state === "stopping";
 
 /** @param {{id: string}} props */
-export function RetunesView({ id }) {
+export function BatchesView({ id }) {
   return id ? html`<${One} key=${id} id=${id} />` : html`<${All} key="all" />`;
 }
 
@@ -31,9 +31,9 @@ function All() {
   const mark = jobs.value.map((each) => `${each.id}${each.state}`).join();
   const going = !rows || rows.some(isGoing);
   useEffect(() => {
-    document.title = "Retunes · Loopwright";
+    document.title = "Batches · Loopwright";
     const stop = new AbortController();
-    const look = () => askPage(`/retunes?limit=${shown.current}`, stop.signal).then((found) => {
+    const look = () => askPage(`/batches?limit=${shown.current}`, stop.signal).then((found) => {
       setRows(found.entries);
       setNext(found.next);
       setProblem("");
@@ -55,11 +55,11 @@ function All() {
       setProblem(/** @type {Error} */ (error).message);
     }
   };
-  return html`<div><div class="pagehead" key="head"><h1>Retunes of many loops</h1></div>
+  return html`<div><div class="pagehead" key="head"><h1>Batches</h1></div>
     ${may.operate.value && html`<${Form} key="form" />`}
     ${problem && html`<p class="refusal" role="alert" key="problem">${problem}</p>`}
     ${rows && (rows.length ? html`<div class="table" key="table" style=${{ marginTop: "16px" }}><table><thead><tr><th>Date</th><th>Asked by</th><th>State</th><th>Loops</th></tr></thead><tbody>
-      ${rows.map((each) => html`<tr class="row" key=${each.id} onClick=${() => go(`/ui${each.url}`)}><td><a href=${`/ui${each.url}`}>${when(each.created_at)}</a></td><td>${each.requested_by}</td><td>${each.state}</td><td>${countWords(each.counts)}</td></tr>`)}</tbody></table></div>` : html`<p class="calm" key="none">No retune of many loops was asked for yet.</p>`)}
+      ${rows.map((each) => html`<tr class="row" key=${each.id} onClick=${() => go(`/ui${each.url}`)}><td><a href=${`/ui${each.url}`}>${when(each.created_at)}</a></td><td>${each.by}</td><td>${each.state}</td><td>${countWords(each.counts)}</td></tr>`)}</tbody></table></div>` : html`<p class="calm" key="none">No batch was asked for yet.</p>`)}
     ${next && html`<p class="foot" key="more"><button onClick=${more}>More</button></p>`}</div>`;
 }
 
@@ -92,7 +92,7 @@ function Form() {
       return;
     }
     const stop = new AbortController();
-    const timer = setTimeout(() => askWith("/retunes/preview", JSON.parse(text), stop.signal).then((found) => { setPreview({ ...found, of: text }); setProblem(null); }, (error) => { if (!stop.signal.aborted) { setPreview(null); setProblem(error); } }), 300);
+    const timer = setTimeout(() => askWith("/batches/preview", JSON.parse(text), stop.signal).then((found) => { setPreview({ ...found, of: text }); setProblem(null); }, (error) => { if (!stop.signal.aborted) { setPreview(null); setProblem(error); } }), 300);
     return () => {
       clearTimeout(timer);
       stop.abort();
@@ -101,7 +101,7 @@ function Form() {
   const start = async () => {
     setSending(true);
     try {
-      const found = await command("/retunes", { ...body, requested_by: signature.value.trim() });
+      const found = await command("/batches", { ...body, by: signature.value.trim() });
       go(`/ui${found.url}`);
     } catch (error) {
       setProblem(error);
@@ -120,7 +120,7 @@ function Form() {
     ${preview && html`<div key="what" class="explain">${preview.summary.map((/** @type {string} */ line) => html`<p key=${line}>${line}</p>`)}</div>`}
     ${preview?.loops.filter((/** @type {any} */ each) => !each.would_start).map((/** @type {any} */ each) => html`<p class="note" key=${each.loop}><b>${each.loop}</b> ${each.obstacles[0]?.detail}. ${each.obstacles[0]?.advice}</p>`)}
     ${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice}</span></p>`}
-    <div class="foot" key="foot"><label class="left">Signed <input type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && !dead) void start(); }} /></label>
+    <div class="foot" key="foot"><label class="left">Your name <input type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter" && !dead) void start(); }} /></label>
       <span class="quiet" role="status">${bad}</span>
       <button class="main" disabled=${dead} onClick=${start}>${preview ? `Retune ${preview.would_start} ${preview.would_start === 1 ? "loop" : "loops"}` : "Retune"}</button></div></section>`;
 }
@@ -133,9 +133,9 @@ function One({ id }) {
   const [aborting, setAborting] = useState("");
   const mark = jobs.value.map((each) => `${each.id}${each.state}${each.stage}`).join();
   useEffect(() => {
-    document.title = `Retune ${id} · Loopwright`;
+    document.title = `Batch ${id} · Loopwright`;
     const stop = new AbortController();
-    const look = () => ask(`/retunes/${encodeURIComponent(id)}`, stop.signal).then((now) => { setFound(now); setProblem(""); }, (error) => { if (!stop.signal.aborted) setProblem(error.message); });
+    const look = () => ask(`/batches/${encodeURIComponent(id)}`, stop.signal).then((now) => { setFound(now); setProblem(""); }, (error) => { if (!stop.signal.aborted) setProblem(error.message); });
     void look();
     const timer = setInterval(look, AGAIN_MS);
     return () => {
@@ -143,7 +143,7 @@ function One({ id }) {
       clearInterval(timer);
     };
   }, [id, mark]);
-  if (!found) return html`<p class="calm" role="status">${problem || "Asking for the retune…"}</p>`;
+  if (!found) return html`<p class="calm" role="status">${problem || "Asking for the batch…"}</p>`;
   const going = isGoing(found);
   const abort = async () => {
     setAsking(false);
@@ -155,9 +155,9 @@ function One({ id }) {
       setAborting(notAborted(/** @type {import("../api.js").Problem} */ (error)));
     }
   };
-  return html`<div><div class="pagehead" key="head"><h1>Retune of ${found.loops.length} ${found.loops.length === 1 ? "loop" : "loops"}</h1><span class="quiet">${when(found.created_at)} · ${found.requested_by} · ${found.state}</span><span class="sentence">${countWords(found.counts)}</span></div>
+  return html`<div><div class="pagehead" key="head"><h1>Batch of ${found.loops.length} ${found.loops.length === 1 ? "loop" : "loops"}</h1><span class="quiet">${when(found.created_at)} · ${found.by} · ${found.state}</span><span class="sentence">${countWords(found.counts)}</span></div>
     ${found.detail && html`<p class="refusal" key="detail">${found.detail}</p>`}${problem && html`<p class="refusal" role="alert" key="problem">${problem}</p>`}${aborting && html`<p class="refusal" role="alert" key="aborting">${aborting}</p>`}
-    ${going && may.operate.value && html`<p class="foot" key="abort">${asking ? html`<span key="q">This ends the retune of all ${found.loops.length} loops.</span><button key="no" onClick=${() => setAsking(false)}>Go on</button><button key="yes" class="abort" onClick=${abort}>Abort all ${found.loops.length}</button>` : html`<button key="ask" class="abort" onClick=${() => setAsking(true)}>Abort all ${found.loops.length}…</button>`}</p>`}
+    ${going && may.operate.value && html`<p class="foot" key="abort">${asking ? html`<span key="q">This ends the batch of ${found.loops.length} loops.</span><button key="no" onClick=${() => setAsking(false)}>Go on</button><button key="yes" class="abort" onClick=${abort}>Abort all ${found.loops.length}</button>` : html`<button key="ask" class="abort" onClick=${() => setAsking(true)}>Abort all ${found.loops.length}…</button>`}</p>`}
     <div class="table" key="table"><table><thead><tr><th>Loop</th><th>State</th><th>Result</th><th>Job</th></tr></thead><tbody>
       ${found.loops.map((/** @type {any} */ each) => {
         const live = jobs.value.find((job) => job.url === each.job);

@@ -10,14 +10,14 @@ from enum import StrEnum
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from loopwright.service.states.job_state import ACTIVE, JobState, shown
+from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.store import audit, claims
 from loopwright.service.store.clock import now
-from loopwright.service.store.tables import JobRow, RetuneLoopRow, RetuneRow
+from loopwright.service.store.tables import BatchLoopRow, BatchRow, JobRow
 from loopwright.tuning.reasons import Reason
 
 
-class RetuneState(StrEnum):
+class BatchState(StrEnum):
     """The value is what the API shows and the database holds."""
 
     RUNNING = "running"
@@ -35,21 +35,21 @@ class StopReason(StrEnum):
     SERVICE_STOPPED = "service_stopped"
 
 
-OPEN = (RetuneState.RUNNING, RetuneState.STOPPING)
+OPEN = (BatchState.RUNNING, BatchState.STOPPING)
 WAITING, SKIPPED = "waiting", "skipped"
 _FAILURES = frozenset({JobState.REFUSED, JobState.FAILED, JobState.INTERRUPTED})
 _NOBODYS_FAULT = frozenset({Reason.OPERATOR.value, Reason.SERVICE_STOPPED.value})
 _CLOSED = (Reason.LOCKED.value, Reason.NOT_ACKNOWLEDGED.value)
 
 
-class NoSuchRetune(Exception):
+class NoSuchBatch(Exception):
     """No retune of that id."""
 
-    def __init__(self, retune_id: str) -> None:
-        super().__init__(f"there is no retune {retune_id}")
+    def __init__(self, batch_id: str) -> None:
+        super().__init__(f"there is no batch {batch_id}")
 
 
-class RetuneOver(Exception):
+class BatchOver(Exception):
     """The retune begins no more jobs, or has ended."""
 
 
@@ -100,129 +100,127 @@ class Part:
         return SKIPPED if self.given_up or self.job_state is None else self.job_state.value
 
 
-def add(
-    session: Session, host: str, request: Mapping[str, object], loops: Sequence[str], requested_by: str
-) -> RetuneRow:
+def add(session: Session, host: str, request: Mapping[str, object], loops: Sequence[str], by: str) -> BatchRow:
     """A new retune of these loops, in this order."""
-    row = RetuneRow(
+    row = BatchRow(
         id=secrets.token_hex(6),
         host=host,
-        state=RetuneState.RUNNING.value,
+        state=BatchState.RUNNING.value,
         request=request,
-        requested_by=requested_by,
+        by=by,
         created_at=now(),
     )
     session.add(row)
     session.flush()
-    session.add_all(RetuneLoopRow(retune_id=row.id, position=n, loop=loop) for n, loop in enumerate(loops))
+    session.add_all(BatchLoopRow(batch_id=row.id, position=n, loop=loop) for n, loop in enumerate(loops))
     after = {"request": request, "loops": list(loops)}
-    audit.record(session, "retune_many", row.id, after=after, said_by=requested_by)
-    claims.made(session, f"/retunes/{row.id}")
+    audit.record(session, "batch", row.id, after=after, by=by)
+    claims.made(session, f"/batches/{row.id}")
     return row
 
 
-def find(session: Session, retune_id: str, lock: bool = False) -> RetuneRow:
-    """Raises NoSuchRetune. lock: nobody else, on whatever host, changes it before this transaction ends."""
-    wanted = select(RetuneRow).where(RetuneRow.id == retune_id)
+def find(session: Session, batch_id: str, lock: bool = False) -> BatchRow:
+    """Raises NoSuchBatch. lock: nobody else, on whatever host, changes it before this transaction ends."""
+    wanted = select(BatchRow).where(BatchRow.id == batch_id)
     row = session.scalars(wanted.with_for_update() if lock else wanted).one_or_none()
     if row is None:
-        raise NoSuchRetune(retune_id)
+        raise NoSuchBatch(batch_id)
     return row
 
 
-def parts(session: Session, retune_id: str) -> list[Part]:
+def parts(session: Session, batch_id: str) -> list[Part]:
     """Its loops in order."""
     wanted = (
-        select(RetuneLoopRow, JobRow.state, JobRow.dry_run, JobRow.reason, JobRow.detail)
-        .outerjoin(JobRow, JobRow.id == RetuneLoopRow.job_id)
-        .where(RetuneLoopRow.retune_id == retune_id)
-        .order_by(RetuneLoopRow.position)
+        select(BatchLoopRow, JobRow.state, JobRow.reason, JobRow.detail)
+        .outerjoin(JobRow, JobRow.id == BatchLoopRow.job_id)
+        .where(BatchLoopRow.batch_id == batch_id)
+        .order_by(BatchLoopRow.position)
     )
     return [
         Part(
             row.position,
             row.loop,
             row.job_id,
-            shown(state, dry) if state else None,
+            JobState(state) if state else None,
             reason if row.detail is None else row.reason,
             detail if row.detail is None else row.detail,
             given_up=row.detail is not None,
         )
-        for row, state, dry, reason, detail in session.execute(wanted)
+        for row, state, reason, detail in session.execute(wanted)
     ]
 
 
 def of_job(session: Session, job_id: str) -> str | None:
     """Id of the retune that has begun the job; None: there is none."""
-    return session.scalar(select(RetuneLoopRow.retune_id).where(RetuneLoopRow.job_id == job_id).limit(1))
+    return session.scalar(select(BatchLoopRow.batch_id).where(BatchLoopRow.job_id == job_id).limit(1))
 
 
-def unfinished(session: Session, host: str) -> list[RetuneRow]:
+def unfinished(session: Session, host: str) -> list[BatchRow]:
     """Those that the host has to drive, the oldest first."""
-    mine = (RetuneRow.host == host, RetuneRow.ended_at.is_(None))
-    return list(session.scalars(select(RetuneRow).where(*mine).order_by(RetuneRow.number)))
+    mine = (BatchRow.host == host, BatchRow.ended_at.is_(None))
+    return list(session.scalars(select(BatchRow).where(*mine).order_by(BatchRow.number)))
 
 
-def recent(session: Session, limit: int, before: int | None) -> Sequence[RetuneRow]:
+def recent(session: Session, limit: int, before: int | None) -> Sequence[BatchRow]:
     """The latest first; before: only those with a smaller number."""
-    wanted = select(RetuneRow).order_by(RetuneRow.number.desc()).limit(limit)
+    wanted = select(BatchRow).order_by(BatchRow.number.desc()).limit(limit)
     if before is not None:
-        wanted = wanted.where(RetuneRow.number < before)
+        wanted = wanted.where(BatchRow.number < before)
     return session.scalars(wanted).all()
 
 
-def begins(retune_id: str, position: int) -> Callable[[Session, JobRow], None]:
-    """Notes the job that a loop gets, in the transaction that makes it: raises RetuneOver, and there is no job, when
+def begins(batch_id: str, position: int) -> Callable[[Session, JobRow], None]:
+    """Notes the job that a loop gets, in the transaction that makes it: raises BatchOver, and there is no job, when
     the retune was stopped meanwhile."""
 
     def write(session: Session, job: JobRow) -> None:
-        if find(session, retune_id, lock=True).state != RetuneState.RUNNING:
-            raise RetuneOver(retune_id)
-        _set(session, retune_id, position, job_id=job.id)
+        if find(session, batch_id, lock=True).state != BatchState.RUNNING:
+            raise BatchOver(batch_id)
+        _set(session, batch_id, position, job_id=job.id)
 
     return write
 
 
-def give_up(session: Session, retune_id: str, position: int, detail: str, reason: Reason | None = None) -> None:
+def give_up(session: Session, batch_id: str, position: int, detail: str, reason: Reason | None = None) -> None:
     """Notes why a loop will have no job, or no other than that which was cut short."""
-    _set(session, retune_id, position, detail=detail, reason=None if reason is None else reason.value)
+    _set(session, batch_id, position, detail=detail, reason=None if reason is None else reason.value)
 
 
 def stop(
-    session: Session, retune_id: str, reason: StopReason, detail: str, by: str | None = None, at: str | None = None
+    session: Session, batch_id: str, reason: StopReason, detail: str, by: str | None = None, at: str | None = None
 ) -> bool:
     """From now on it begins no more jobs. False when that was so already.
 
     by: who asked for it, for the audit log; at: when, None for now.
 
-    Raises NoSuchRetune, and RetuneOver when it has ended.
+    Raises NoSuchBatch, and BatchOver when it has ended.
     """
-    row = find(session, retune_id, lock=True)
+    row = find(session, batch_id, lock=True)
     if row.state not in OPEN:
-        raise RetuneOver(
-            f"retune {retune_id} ended at {row.ended_at} as {row.state}: nothing of it is left to stop. "
-            f"GET /retunes/{retune_id} says what became of each loop"
+        raise BatchOver(
+            f"batch {batch_id} ended at {row.ended_at} as {row.state}: nothing of it is left to stop. "
+            f"GET /batches/{batch_id} says what became of each loop"
         )
-    claims.changed(session, f"/retunes/{retune_id}")
+    claims.changed(session, f"/batches/{batch_id}")
     if row.stop_reason == StopReason.OPERATOR or row.stop_reason == reason:
         return False
-    row.state, row.stop_reason, row.detail = RetuneState.STOPPING.value, reason.value, detail
+    row.state, row.stop_reason, row.detail = BatchState.STOPPING.value, reason.value, detail
     if by is not None:
-        audit.record(session, "retune_many_abort", retune_id, after={"reason": reason.value}, said_by=by, at=at)
+        audit.record(session, "batch_abort", batch_id, after={"reason": reason.value}, by=by, at=at)
     return True
 
 
-def end(session: Session, retune_id: str) -> None:
+def end(session: Session, batch_id: str) -> None:
     """Notes that nothing of it runs any more."""
-    row = find(session, retune_id, lock=True)
+    row = find(session, batch_id, lock=True)
     if row.stop_reason is None:
-        row.state = RetuneState.DONE.value
+        row.state = BatchState.DONE.value
     else:
         aborted = row.stop_reason == StopReason.OPERATOR
-        row.state = (RetuneState.ABORTED if aborted else RetuneState.STOPPED).value
+        row.state = (BatchState.ABORTED if aborted else BatchState.STOPPED).value
     row.ended_at = now()
 
 
-def _set(session: Session, retune_id: str, position: int, **columns: str | None) -> None:
-    one = (RetuneLoopRow.retune_id == retune_id, RetuneLoopRow.position == position)
-    session.execute(update(RetuneLoopRow).where(*one).values(**columns))
+def _set(session: Session, batch_id: str, position: int, **columns: str | None) -> None:
+    one = (BatchLoopRow.batch_id == batch_id, BatchLoopRow.position == position)
+    session.execute(update(BatchLoopRow).where(*one).values(**columns))

@@ -1,6 +1,7 @@
-"""The loops that are looked after: those of jobs whose end did not find them home, until they are or somebody says so.
+"""The loops that are monitored: those of jobs whose end did not confirm that they were restored, until they are or
+somebody says so.
 
-The column is `JobRow.look_after`; everything that ends it writes an event of the job.
+The column is `JobRow.restore_unconfirmed`; everything that ends it writes an event of the job.
 """
 
 from __future__ import annotations
@@ -20,68 +21,76 @@ from loopwright.service.store.tables import JobRow
 
 
 def rows(store: Store, loop: str | None = None) -> Sequence[Job]:
-    """The jobs of this host with a loop that is looked after, or those of one loop on whatever host; the latest
+    """The jobs of this host with a loop that is monitored, or those of one loop on whatever host; the latest
     first."""
     mine = JobRow.host == store.host if loop is None else JobRow.loop == loop
     with store.reading() as session:
-        wanted = select(JobRow).where(mine, JobRow.look_after.is_(True)).order_by(JobRow.number.desc())
+        wanted = select(JobRow).where(mine, JobRow.restore_unconfirmed.is_(True)).order_by(JobRow.number.desc())
         return [Job.from_row(row) for row in session.scalars(wanted)]
 
 
 def count(session: Session, host: str) -> int:
-    """How many loops of a host are looked after."""
-    wanted = select(func.count(distinct(JobRow.loop))).where(JobRow.host == host, JobRow.look_after.is_(True))
+    """How many loops of a host are monitored."""
+    wanted = select(func.count(distinct(JobRow.loop))).where(JobRow.host == host, JobRow.restore_unconfirmed.is_(True))
     return session.scalar(wanted) or 0
 
 
-def home_again(store: Store, job_id: str, restored: Mapping[str, object], text: str, held: bool = False) -> bool:
+def confirmed(store: Store, job_id: str, restored: Mapping[str, object], text: str, held: bool = False) -> bool:
     """The loop was read back. False when somebody else was faster to end it.
 
     held: whether it is held in manual, because its PV was found to be false."""
     with store.writing() as session:
-        wanted = select(JobRow).where(JobRow.id == job_id, JobRow.look_after.is_(True)).with_for_update()
+        wanted = select(JobRow).where(JobRow.id == job_id, JobRow.restore_unconfirmed.is_(True)).with_for_update()
         row = session.scalars(wanted).one_or_none()
         if row is None:
             return False
-        row.look_after, row.restored, row.false_pv = False, json_object(restored), row.false_pv or held
+        row.restore_unconfirmed, row.restored, row.false_pv = False, json_object(restored), row.false_pv or held
         append(session, row.id, "loop_found", {"text": text}, row.plant_time_s)
         return True
 
 
 def opened(job_id: str, columns: JobColumns) -> Write:
-    """The job has opened a session of its own: its loop is looked after for no other job. columns: what else is now
+    """The job has opened a session of its own: its loop is monitored for no other job. columns: what else is now
     known of the job."""
-    text = f"looked after no more: job {job_id} has opened a session on the loop"
+    text = f"monitored no more: job {job_id} has opened a session on the loop"
 
     def write(session: Session) -> None:
         job = session.scalars(select(JobRow).where(JobRow.id == job_id).with_for_update()).one()
         set_columns(job, columns)
         for row in _of_loop(session, job.loop):
             if row.id != job_id:
-                row.look_after = False
+                row.restore_unconfirmed = False
                 append(session, row.id, "loop_found", {"text": text}, row.plant_time_s)
 
     return write
 
 
-def dismissed(store: Store, loop: str, by: str) -> list[str]:
-    """A person answers for the loop. Returns the ids of the jobs it was looked after for, or that had found its PV to
+def acknowledged(store: Store, loop: str, by: str) -> list[str]:
+    """A person answers for the loop. Returns the ids of the jobs it was monitored for, or that had found its PV to
     be false."""
     with store.writing() as session:
         false = false_pv.not_acknowledged(session, loop, lock=True)
         found = {row.id: row for row in (*_of_loop(session, loop), *false)}
         for row in found.values():
-            before = {"look_after": row.look_after, "reason": row.reason}
-            append(session, row.id, "dismissed", {"by": by}, row.plant_time_s)
-            audit.record(session, "dismiss", row.id, before=before, after={"look_after": False}, loop=loop, said_by=by)
-            if row.look_after:
-                row.look_after = False
-                alarms.signed_off_with(session, row, alarms.NOT_RESTORED, by)
+            before = {"restore_unconfirmed": row.restore_unconfirmed, "reason": row.reason}
+            append(session, row.id, "acknowledged", {"by": by}, row.plant_time_s)
+            audit.record(
+                session,
+                "acknowledge",
+                row.id,
+                before=before,
+                after={"restore_unconfirmed": False},
+                loop=loop,
+                by=by,
+            )
+            if row.restore_unconfirmed:
+                row.restore_unconfirmed = False
+                alarms.acknowledged_with(session, row, alarms.NOT_RESTORED, by)
             if row in false:
-                alarms.signed_off_with(session, row, false_pv.FALSE_PV, by)
+                alarms.acknowledged_with(session, row, false_pv.FALSE_PV, by)
         return list(found)
 
 
 def _of_loop(session: Session, loop: str) -> Sequence[JobRow]:
-    wanted = select(JobRow).where(JobRow.loop == loop, JobRow.look_after.is_(True)).order_by(JobRow.number)
+    wanted = select(JobRow).where(JobRow.loop == loop, JobRow.restore_unconfirmed.is_(True)).order_by(JobRow.number)
     return session.scalars(wanted.with_for_update()).all()

@@ -1,5 +1,5 @@
 // @ts-check
-/** Signing an alarm off: a person answers for it, under a name. */
+/** Acknowledging an alarm: a person answers for it, under a name. */
 import { signal } from "../../vendor/signals-core.js";
 import { useEffect, useRef, useState } from "../../vendor/hooks.js";
 import { command } from "../api.js";
@@ -10,13 +10,13 @@ import { isSilent, may, sign, signature } from "../state.js";
 export const asking = signal("");
 
 /** @param {import("../alarms.js").Alarm} alarm @returns what opens the question; null where the key or the alarm does not permit it. */
-export function SignOffButton(alarm) {
-  if (!alarm.to_sign || !may.operate.value || asking.value === alarm.id) return null;
-  return html`<button key="sign" class="signoff" disabled=${isSilent.value} aria-label=${`Sign off: ${alarm.subject}, ${alarm.text}`} onClick=${() => (asking.value = alarm.id)}>Sign off…</button>`;
+export function AcknowledgeButton(alarm) {
+  if (!alarm.unacknowledged || !may.operate.value || asking.value === alarm.id) return null;
+  return html`<button key="sign" class="acknowledge" disabled=${isSilent.value} aria-label=${`Acknowledge: ${alarm.subject}, ${alarm.text}`} onClick=${() => (asking.value = alarm.id)}>Acknowledge…</button>`;
 }
 
 /** @param {{alarm: import("../alarms.js").Alarm}} props */
-export function SignOffQuestion({ alarm }) {
+export function AcknowledgeQuestion({ alarm }) {
   const field = useRef(/** @type {HTMLInputElement | null} */ (null));
   const [sending, setSending] = useState(false);
   const [problem, setProblem] = useState("");
@@ -33,7 +33,7 @@ export function SignOffQuestion({ alarm }) {
     setSending(true);
     setProblem("");
     try {
-      await command(`/alarms/${encodeURIComponent(alarm.id)}/sign-off`, { by: signature.value.trim() });
+      await command(`/alarms/${encodeURIComponent(alarm.id)}/acknowledge`, { by: signature.value.trim() });
       close(); // the stream takes it off the list
     } catch (error) {
       setProblem(/** @type {Error} */ (error).message);
@@ -44,9 +44,9 @@ export function SignOffQuestion({ alarm }) {
     if (e.key === "Enter") void send();
     if (e.key === "Escape") close();
   };
-  return html`<div class="signoff" role="group" aria-label=${`Sign off: ${alarm.subject}, ${alarm.text}`}>
+  return html`<div class="acknowledge" role="group" aria-label=${`Acknowledge: ${alarm.subject}, ${alarm.text}`}>
     <span class="say">I have looked at <b>${alarm.subject}</b> and answer for it.</span>
-    <label key="by">Signed <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${keys} /></label>
-    <button key="cancel" onClick=${close}>Cancel</button><button key="go" class="main" disabled=${dead} onClick=${send}>Sign off</button>
+    <label key="by">Your name <input ref=${field} type="text" maxlength="100" autocomplete="name" value=${signature.value} onInput=${(/** @type {any} */ e) => sign(e.target.value)} onKeyDown=${keys} /></label>
+    <button key="cancel" onClick=${close}>Cancel</button><button key="go" class="main" disabled=${dead} onClick=${send}>Acknowledge</button>
     ${problem && html`<p key="problem" class="refusal" role="alert">${problem}</p>`}</div>`;
 }
