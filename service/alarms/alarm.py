@@ -74,7 +74,7 @@ class Acknowledgement(BaseModel):
 
 
 class Alarm(BaseModel):
-    """Something that needs a look."""
+    """An alarm."""
 
     model_config = ConfigDict(frozen=True)
 

@@ -46,7 +46,7 @@ def test_a_second_path_is_found_in_operation_and_rolled_back(site: SimulatedSite
     person.sign(page)
     page.get_by_role("button", name=f"Write to {TAG}").click()
     expect(person.headline(page)).to_have_text("Accepted")
-    watch = page.get_by_role("region", name="Watch after acceptance")
+    watch = page.get_by_role("region", name="Monitoring after acceptance")
     expect(watch).to_contain_text("Nothing has moved the loop yet since the gains were accepted.")
     expect(watch).to_contain_text("The previous gains are put back automatically if PV leaves its limits")
     assert loop.watch.auto_rollback and loop.watch.by == NAME and loop.service.controller.state.gains == NEW
@@ -75,6 +75,6 @@ def test_that_the_old_gains_come_back_by_itself_can_be_declined(site: SimulatedS
     page.get_by_role("checkbox", name="Put the previous gains back automatically").uncheck()
     person.sign(page)
     page.get_by_role("button", name=f"Write to {TAG}").click()
-    watch = page.get_by_role("region", name="Watch after acceptance")
+    watch = page.get_by_role("region", name="Monitoring after acceptance")
     expect(watch).to_contain_text("The previous gains are not put back automatically.")
     assert not site.loop.watch.auto_rollback

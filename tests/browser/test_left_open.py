@@ -114,7 +114,7 @@ class TestWhatOthersDo:
         self, site: SimulatedSite, pages: Pages
     ) -> None:
         page = pages.open(LOOP)
-        known = page.get_by_role("region", name="What is known of the plant")
+        known = page.get_by_role("region", name="Process model")
         found = {
             "knowledge": {"Ms": 1.61, "uncertainty": 0.02, "model": {"dead_time_s": 2.0}, "changes": 3, "consistent": 0,
                           "text": "Ms known"},

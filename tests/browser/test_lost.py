@@ -41,7 +41,7 @@ def all_is_live(page: Page) -> None:
 
 def first_silence_s(page: Page) -> int:
     """The seconds of silence, as the page counted them, that its banner named first."""
-    return int(person.number(next(text for text in person.remembered(page) if "No word" in text)))
+    return int(person.number(next(text for text in person.remembered(page) if "Service offline" in text)))
 
 
 @contextmanager

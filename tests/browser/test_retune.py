@@ -18,7 +18,9 @@ STAGES = ["Steady-state check", "Relay test", "Model and gains", "Set-point step
 
 def assert_drawn(page: Page, values: list[float]) -> None:
     """The new curve of the set-point step goes through these values, on a linear axis."""
-    path = page.get_by_role("img", name="Set-point step before and after").locator("path.s-new").get_attribute("d")
+    path = (
+        page.get_by_role("img", name="Set-point step, previous and new gains").locator("path.s-new").get_attribute("d")
+    )
     places = np.array([float(y) for y in re.findall(r"[ML][\d.]+ ([\d.]+)", path or "")])
     slope, at_zero = np.polyfit(values, places, 1)
     assert slope < 0.0 and places == pytest.approx(at_zero + slope * np.array(values), abs=0.11)

@@ -79,7 +79,7 @@ def test_a_key_that_may_read_has_no_button_that_changes_something(
     expect(person.face(page).locator(".big")).to_have_text("50.000")  # where one wanted to go
     expect(page.get_by_text("Your key may read. To retune it needs the scope operate.")).to_be_visible()
     main = page.get_by_role("main")
-    expect(page.get_by_role("region", name="What is known of the plant")).to_be_visible()
+    expect(page.get_by_role("region", name="Process model")).to_be_visible()
     for name in ("Retune", "Accept", "Abort", "Keep the old", "Roll back"):
         expect(page.get_by_role("button", name=name)).not_to_be_attached()
     expect(page.get_by_role("link", name="Log")).not_to_be_attached()

@@ -33,7 +33,7 @@ export function LoopView({ tag }) {
   const [open, setOpen] = useState(/** @type {boolean | null} */ (null));
   const job = jobs.value.find((each) => each.loop === tag && !each.dry_run) ?? null;
   const row = rowOf(tag).value;
-  const mark = `${row?.job ?? ""} ${row?.last_job?.url ?? ""} ${row?.last_job?.state ?? ""} ${loop?.locked?.since ?? ""} ${row?.no_data ? "not heard" : ""}`;
+  const mark = `${row?.job ?? ""} ${row?.last_job?.url ?? ""} ${row?.last_job?.state ?? ""} ${loop?.locked?.since ?? ""} ${row?.no_data ? "no data" : ""}`;
 
   useEffect(() => {
     document.title = `${tag} · Loopwright`;

@@ -178,8 +178,8 @@ function What(p, loop) {
   const hasPv = (/** @type {any} */ each) => known(each.pv_low) && known(each.pv_high);
   return html`<p key="what">The loop is tested around where it is now.
       ${pulses && html` The set-point is pulsed by <b>${pv(pulses.sp_move)}</b> under the present gains.`}
-      ${manual && p.first_mv_move_pct !== null && html` The loop stays in manual: the manual output goes away by about <b>${fixed(p.first_mv_move_pct, 1)} %</b> at first${known(manual.mv_low_pct) ? html`, later within <b>${fixed(manual.mv_low_pct, 0)} … ${fixed(manual.mv_high_pct, 0)} %</b>` : ""}, and back each time. The new gains are <b>not tried</b>.`}
-      ${relay && p.first_mv_move_pct !== null && p.mv !== null && html` ${pulses ? "Where that tells too little, MV" : "MV"} goes by about <b>${fixed(p.first_mv_move_pct, 0)} %</b> from ${fixed(p.mv, 0)} %, in turn up and down a few times, within <b>${fixed(relay.mv_low_pct, 0)} … ${fixed(relay.mv_high_pct, 0)} %</b>.`}
+      ${manual && html` The loop stays in manual: the manual output is pulsed, and returns each time. The new gains are <b>not tested</b>.`}
+      ${relay && html` ${pulses ? "Where that tells too little, a relay switches MV" : "A relay switches MV"} up and down a few times.`}
       ${step && known(step.sp_move) && step.sp_move > 0 && html` Then the set-point steps by <b>${pv(step.sp_move)}</b>${verify ? " under the new gains" : ""}.`}</p>
     <p key="goes">${known(p.mv_low_pct) && html`MV moves between <b>${fixed(p.mv_low_pct, 0)} and ${fixed(p.mv_high_pct, 0)} %</b> (present ${fixed(p.mv, 0)} %). `}${known(p.pv_low)
       ? html`PV is expected between <b>${fixed(p.pv_low, decimals)} and ${pv(p.pv_high)}</b>, by ${p.pv_known_by}.`

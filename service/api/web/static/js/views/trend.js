@@ -169,7 +169,7 @@ export function Trend({ loop, job, height, onJob }) {
           join(false);
           return;
         }
-        // After a break of the stream, which may be one of the service: what was not heard is not drawn.
+        // After a break of the stream, which may be one of the service: what did not come is not drawn.
         const late_s = found.at_s.length ? found.at_s[0] - it.ring.last : 0;
         if (found.past ? late_s > 0 : it.opened !== stream.opened && late_s > GAP_S) it.ring.gap();
         it.opened = stream.opened;
