@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.command import parser_of
 from benchmarks.plants import Plant, plants
-from loopwright.tuning.fast.design import Aim, DesignSpec, GainDesign
+from loopwright.tuning.fast.design.design import Aim, DesignSpec, GainDesign
 
 PLAIN = (1.0, 1.0)
 HEAD = (

@@ -24,12 +24,12 @@ from benchmarks.trouble.kinds import TROUBLES
 from benchmarks.trouble.plants import trouble_plants
 from benchmarks.trouble.runs import run_of
 from loopwright.tuning.analysis.margins import margins
-from loopwright.tuning.fast.design import frequencies
-from loopwright.tuning.fast.procedure import FAST
-from loopwright.tuning.fast.proposal import EvaluationSummary
+from loopwright.tuning.fast.design.design import frequencies
+from loopwright.tuning.fast.design.uncertainty import distance_from_instability, filter_ratio, seen_covariance
+from loopwright.tuning.fast.evaluation.proposal import EvaluationSummary
+from loopwright.tuning.fast.pulses.procedure import SETPOINT
 from loopwright.tuning.fast.record import ExperimentRecord
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT
-from loopwright.tuning.fast.uncertainty import distance_from_instability, filter_ratio, seen_covariance
+from loopwright.tuning.fast.relay.procedure import FAST
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import UNDISTURBED, Fit
 from loopwright.tuning.identification.sensitivity import sensitivities

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from benchmarks.disturbances import Disturbance
 from benchmarks.plants import SAMPLES_PER_PERIOD, Plant
-from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.design.design import DesignSpec
 
 ASKED = 1.6
 PI = DesignSpec(ASKED)

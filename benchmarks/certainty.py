@@ -18,7 +18,7 @@ from benchmarks.operation import Kind, operation
 from benchmarks.plants import Plant
 from loopwright.service.cli.plots import style
 from loopwright.tuning.analysis.margins import margins, ultimate_point
-from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.design.design import DesignSpec
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.operation.history import Stretch

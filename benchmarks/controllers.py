@@ -29,9 +29,9 @@ from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import run
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.procedure import FAST, FastOptions, fast
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT, setpoint
+from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.pulses.procedure import SETPOINT, setpoint
+from loopwright.tuning.fast.relay.procedure import FAST, FastOptions, fast
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.plan import Mode
@@ -82,7 +82,8 @@ def measure(plant: Plant, kind: str, seed: int, method: str, checked: bool = Tru
     plan = fast(facts, options) if isinstance(options, FastOptions) else setpoint(facts, options)
     with ExitStack() as patched:
         if not checked:
-            patched.enter_context(patch("loopwright.tuning.fast.controller_effect.mismatch", lambda evaluation: None))
+            effect = "loopwright.tuning.fast.evaluation.controller_effect"
+            patched.enter_context(patch(f"{effect}.mismatch", lambda evaluation: None))
             patched.enter_context(patch("loopwright.tuning.experiments.preflight.check_law_at_rest", lambda *_: None))
         ran = run(plan, loop, limits=RunLimits(max_time_s=100.0 * plant.Pu))
     found = Controlled(kind, method, plant.name, seed)

@@ -38,11 +38,11 @@ from loopwright.service.execution.runner import RunResult, run
 from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE, at_rest
 from loopwright.tuning.experiments.primitives import Facts, record
-from loopwright.tuning.fast.manual_procedure import MANUAL, by_manual
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.procedure import FAST, FastOptions, fast
-from loopwright.tuning.fast.relay_test import RelayTest
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT, setpoint
+from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.manual.procedure import MANUAL, by_manual
+from loopwright.tuning.fast.pulses.procedure import SETPOINT, setpoint
+from loopwright.tuning.fast.relay.procedure import FAST, FastOptions, fast
+from loopwright.tuning.fast.relay.relay_test import RelayTest
 from loopwright.tuning.five_stage.procedure import PROCEDURE, Options, five_stage
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction

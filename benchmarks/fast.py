@@ -26,8 +26,8 @@ from loopwright.controller.channel import Channel, RelaySettings, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.tuning.analysis.margins import margins
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import evaluate
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.evaluation import evaluate
 from loopwright.tuning.fast.record import ExperimentRecord, oscillation_period
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.disturbances import STRUCTURES

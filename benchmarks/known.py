@@ -36,10 +36,10 @@ from loopwright.service.execution.runner import run
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.fast.excitation_choice import fast_by
-from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
-from loopwright.tuning.fast.known_procedure import TrialFigures
-from loopwright.tuning.fast.procedure import FastOptions
+from loopwright.tuning.fast.known_plant.plant import NothingKnown, ObservedPlant
+from loopwright.tuning.fast.known_plant.procedure import TrialFigures
 from loopwright.tuning.fast.record import Excitation
+from loopwright.tuning.fast.relay.procedure import FastOptions
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import sign
 from loopwright.tuning.operation.known import known_plant

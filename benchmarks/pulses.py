@@ -42,9 +42,9 @@ from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import run
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE
 from loopwright.tuning.experiments.primitives import Directions, Facts
-from loopwright.tuning.fast.manual_procedure import MANUAL, by_manual
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT, setpoint
+from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.manual.procedure import MANUAL, by_manual
+from loopwright.tuning.fast.pulses.procedure import SETPOINT, setpoint
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Command, Event, Mode, Sample, SetGains, SetOutput, SetSetpoint, StageStarted
 from loopwright.tuning.reasons import Ended

@@ -29,10 +29,10 @@ from loopwright.service.jsonable import to_jsonable
 from loopwright.service.results import EvidenceView, GainsView
 from loopwright.service.states.job_state import JobState
 from loopwright.tuning.experiments.primitives import Facts
+from loopwright.tuning.fast.evaluation.proposal import EvaluationSummary
 from loopwright.tuning.fast.excitation_choice import fast_by
-from loopwright.tuning.fast.procedure import FastOptions
-from loopwright.tuning.fast.proposal import EvaluationSummary
 from loopwright.tuning.fast.record import Excitation
+from loopwright.tuning.fast.relay.procedure import FastOptions
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Event, Mode, StageDone, StageStarted
 

@@ -30,7 +30,7 @@ from benchmarks.trouble.bus_site import TroubleSite, interfaces
 from benchmarks.trouble.report import HEAD, TOO_FAR, line
 from benchmarks.trouble.runs import TroubledRun, measure
 from benchmarks.tuning import runs_parser, some
-from loopwright.tuning.fast.procedure import FAST
+from loopwright.tuning.fast.relay.procedure import FAST
 
 REPEATS = 2
 WAYS = {ON_BUS: "bus", FAST: "rehearsal"}

@@ -47,11 +47,11 @@ from loopwright.service.jobs.stored_record import stored_record
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE, at_rest
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.design import DesignSpec, GainDesign
-from loopwright.tuning.fast.procedure import MIN_SAMPLES, FastOptions, FastProposal, fast
+from loopwright.tuning.fast.design.design import DesignSpec, GainDesign
+from loopwright.tuning.fast.evaluation.record_evaluation import evaluate_again
 from loopwright.tuning.fast.record import ExperimentRecord
-from loopwright.tuning.fast.record_evaluation import evaluate_again
-from loopwright.tuning.fast.relay_test import RelayTest
+from loopwright.tuning.fast.relay.procedure import MIN_SAMPLES, FastOptions, FastProposal, fast
+from loopwright.tuning.fast.relay.relay_test import RelayTest
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, StageStarted

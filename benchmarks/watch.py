@@ -31,7 +31,7 @@ from loopwright.controller.channel import Channel, Settings
 from loopwright.controller.pid import Parameters
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.tuning.analysis.recursion import recursive
-from loopwright.tuning.fast.proposal import FastProposal
+from loopwright.tuning.fast.evaluation.proposal import FastProposal
 from loopwright.tuning.models import Reals, TransferFunction, sign
 from loopwright.tuning.operation.accepted_model import AcceptedModel
 from loopwright.tuning.operation.change_findings import ComparedChange

@@ -211,25 +211,29 @@ class PlantDevice:
     # The object dictionary
 
     def _connect(self, dictionary: Dictionary) -> None:
-        dictionary.on_read.update({
-            "sample_number": lambda sub: self.number,
-            "plant_output_sample_number": lambda sub: self._answered_number,
-            "plant_samples_to_run": lambda sub: self._remaining,
-            "plant_missing_answers": lambda sub: self._missing_in_all,
-            "plant_pv": lambda sub: self.plants[sub - 1].pv,
-            "plant_mv": lambda sub: self.mv[sub - 1],
-        })
-        dictionary.on_write.update({
-            "sample_time": self._write_sample_time,
-            "plant_pace": self._write_pace,
-            "plant_samples_to_run": self._write_run,
-            "plant_disturbance": self._write_disturbance,
-            "plant_gain": self._write_gain,
-            "plant_noise": self._write_noise,
-            "plant_seed": self._only_held,
-            "plant_initialise": self._write_initialise,
-            "plant_mv": self._write_mv,
-        })
+        dictionary.on_read.update(
+            {
+                "sample_number": lambda sub: self.number,
+                "plant_output_sample_number": lambda sub: self._answered_number,
+                "plant_samples_to_run": lambda sub: self._remaining,
+                "plant_missing_answers": lambda sub: self._missing_in_all,
+                "plant_pv": lambda sub: self.plants[sub - 1].pv,
+                "plant_mv": lambda sub: self.mv[sub - 1],
+            }
+        )
+        dictionary.on_write.update(
+            {
+                "sample_time": self._write_sample_time,
+                "plant_pace": self._write_pace,
+                "plant_samples_to_run": self._write_run,
+                "plant_disturbance": self._write_disturbance,
+                "plant_gain": self._write_gain,
+                "plant_noise": self._write_noise,
+                "plant_seed": self._only_held,
+                "plant_initialise": self._write_initialise,
+                "plant_mv": self._write_mv,
+            }
+        )
 
     def _only_held(self, sub: int, value: Value) -> None:
         if self._remaining:

@@ -1,7 +1,7 @@
 """EDS files (CiA 306) of both devices, written from the object table. The committed files describe one channel.
 
-    python -m loopwright.protocol.eds plant [CHANNELS]          prints one
-    python -m loopwright.protocol.eds --write                   writes protocol/eds_files/
+python -m loopwright.protocol.eds plant [CHANNELS]          prints one
+python -m loopwright.protocol.eds --write                   writes protocol/eds_files/
 """
 
 from __future__ import annotations
@@ -95,8 +95,13 @@ def _object(entry: Object, device: Device, channels: int) -> Iterator[str]:
     yield from ("", f"[{section}]", f"ParameterName={entry.text}", f"ObjectType=0x{kind:X}")
     yield f"SubNumber=0x{count + 1:X}"
     yield from (
-        "", f"[{section}sub0]", "ParameterName=Highest sub-index supported", f"ObjectType=0x{_VAR:X}",
-        f"DataType=0x{Type.U8.number:04X}", *_count_of(entry, count), "PDOMapping=0",
+        "",
+        f"[{section}sub0]",
+        "ParameterName=Highest sub-index supported",
+        f"ObjectType=0x{_VAR:X}",
+        f"DataType=0x{Type.U8.number:04X}",
+        *_count_of(entry, count),
+        "PDOMapping=0",
     )
     for sub in range(1, count + 1):
         name = entry.names[sub - 1] if entry.names else f"{entry.text} {sub}"

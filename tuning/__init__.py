@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from loopwright.tuning.analysis.margins import Margins, margins, ultimate_point
     from loopwright.tuning.analysis.step_figures import StepFigures
     from loopwright.tuning.analysis.step_response import Response, step_figures, step_response
-    from loopwright.tuning.fast.method_comparison import ComparedGains, MethodComparison, compare
-    from loopwright.tuning.fast.tuned import METHODS, Tuned, tune
+    from loopwright.tuning.fast.known_plant.method_comparison import ComparedGains, MethodComparison, compare
+    from loopwright.tuning.fast.known_plant.tuned import METHODS, Tuned, tune
     from loopwright.tuning.gains import Gains, Parallel, Series, of_parallel, of_series, to_parallel, to_series
     from loopwright.tuning.identification.identify import Identified, identify
     from loopwright.tuning.identification.overshoot import fopdt_from_overshoot

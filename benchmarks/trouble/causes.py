@@ -26,7 +26,7 @@ from loopwright.controller.pid import Parameters
 from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.runner import run
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.procedure import FastOptions, fast
+from loopwright.tuning.fast.relay.procedure import FastOptions, fast
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.plan import Mode

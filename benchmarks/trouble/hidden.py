@@ -28,10 +28,10 @@ from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import run
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.manual_procedure import MANUAL, by_manual
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.procedure import FAST, FastOptions, fast
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT, setpoint
+from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.manual.procedure import MANUAL, by_manual
+from loopwright.tuning.fast.pulses.procedure import SETPOINT, setpoint
+from loopwright.tuning.fast.relay.procedure import FAST, FastOptions, fast
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.plan import Mode

@@ -25,11 +25,11 @@ from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.jobs.stored_record import stored_record
 from loopwright.tuning.experiments.preflight import PREFLIGHT, SETTLE
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.manual_procedure import MANUAL, by_manual
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.procedure import FAST, FastOptions, FastProposal, fast
+from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.manual.procedure import MANUAL, by_manual
+from loopwright.tuning.fast.pulses.procedure import setpoint
 from loopwright.tuning.fast.record import ExperimentRecord
-from loopwright.tuning.fast.setpoint_procedure import setpoint
+from loopwright.tuning.fast.relay.procedure import FAST, FastOptions, FastProposal, fast
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import (
     Command,

@@ -23,8 +23,8 @@ from loopwright.service.loops.shared_reading import SharedReading
 from loopwright.service.observing.hearing import question
 from loopwright.service.observing.observed import ObservationView, Question, observed
 from loopwright.service.states.loop_state import LoopState
-from loopwright.tuning.fast.design import Aim, DesignSpec
-from loopwright.tuning.fast.options import weights_up_to
+from loopwright.tuning.fast.design.design import Aim, DesignSpec
+from loopwright.tuning.fast.design.options import weights_up_to
 
 
 def router(jobs: Jobs, readings: SharedReading[LoopState | None], listening: Listening, pool: Pool) -> APIRouter:

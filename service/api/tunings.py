@@ -22,9 +22,9 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.stored_record import record_columns, stored_record
 from loopwright.service.offline import tunings
 from loopwright.service.results import DESIGNED
-from loopwright.tuning.fast.design import Aim
-from loopwright.tuning.fast.options import weights_up_to
-from loopwright.tuning.fast.procedure import FAST
+from loopwright.tuning.fast.design.design import Aim
+from loopwright.tuning.fast.design.options import weights_up_to
+from loopwright.tuning.fast.relay.procedure import FAST
 from loopwright.tuning.rules.registry import METHODS
 
 

@@ -115,7 +115,7 @@ def identify_operation(
     from loopwright.service.inputs.model_json import parse_model
     from loopwright.service.observing.exported import exported
     from loopwright.service.observing.observed import ObservationState
-    from loopwright.tuning.fast.design import DesignSpec
+    from loopwright.tuning.fast.design.design import DesignSpec
     from loopwright.tuning.gains import Gains
     from loopwright.tuning.reasons import Reason, Refused
 

@@ -16,7 +16,7 @@ from loopwright.service.cli import job_tables, terminal
 from loopwright.service.cli.client import ApiError, Client, parsed
 from loopwright.service.states.job_state import JobState
 from loopwright.tuning.analysis.comparison import LoopPerformance, loop_performance
-from loopwright.tuning.fast.proposal import delayed
+from loopwright.tuning.fast.evaluation.proposal import delayed
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
 

@@ -27,7 +27,7 @@ def methods(as_json: AsJson = False) -> None:
         print_json(tunings.methods_json())
         return
     from loopwright.service.cli import tuning_tables
-    from loopwright.tuning.fast.tuned import METHODS
+    from loopwright.tuning.fast.known_plant.tuned import METHODS
 
     tuning_tables.methods(METHODS.values())
 

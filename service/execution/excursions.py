@@ -27,14 +27,14 @@ from loopwright.service.planning.expected import NOTHING_EXPECTED, ExpectedPv, L
 from loopwright.service.planning.facts import facts_of
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.design_trial import designed_on, trial
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.proposal import ultimate
 from loopwright.tuning.fast.expected_moves import LAST_LEVEL_TURNS, NewGains, expected_moves
 from loopwright.tuning.fast.experiment import on_trial
-from loopwright.tuning.fast.procedure import FastOptions
-from loopwright.tuning.fast.proposal import ultimate
+from loopwright.tuning.fast.known_plant.design_trial import designed_on, trial
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.relay_test import FIRST_AMPLITUDE, MIN_OUTPUT_RANGE, max_amplitude
+from loopwright.tuning.fast.relay.procedure import FastOptions
+from loopwright.tuning.fast.relay.relay_test import FIRST_AMPLITUDE, MIN_OUTPUT_RANGE, max_amplitude
 from loopwright.tuning.five_stage.procedure import five_stage
 from loopwright.tuning.models import Model, TransferFunction, sign, time_constants
 from loopwright.tuning.plan import Command, Mode, Note, Plan, StageDone, StageStarted, Work

@@ -18,7 +18,7 @@ from loopwright.service.inputs.plausible import Implausible, check_sampling
 from loopwright.service.inputs.validation import lines
 from loopwright.service.results import empty_result
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.procedure import FAST
+from loopwright.tuning.fast.relay.procedure import FAST
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Event, Mode
 from loopwright.tuning.reasons import Ended, Failed, Reason, Refused

@@ -29,7 +29,7 @@ from loopwright.service.store.jobs import JobEvent
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.settle import after_settling
 from loopwright.tuning.fast.excitation_choice import NOT_ASKED
-from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
+from loopwright.tuning.fast.known_plant.plant import NothingKnown, ObservedPlant
 from loopwright.tuning.models import Model
 from loopwright.tuning.plan import Event, Mode, Note, Plan, Sample
 from loopwright.tuning.reasons import Ended, Failed, NoGain, Reason, Refused
@@ -213,8 +213,8 @@ def _procedure(
     begins_with: float | None,
 ) -> Plan[Any]:
     if isinstance(request, FastRetune):
-        from loopwright.tuning.fast.design_trial import trial
         from loopwright.tuning.fast.excitation_choice import fast_by
+        from loopwright.tuning.fast.known_plant.design_trial import trial
 
         known = _known_model(request)
         if known is not None:
@@ -222,7 +222,7 @@ def _procedure(
         options = replace(request.options, begins_with=begins_with)
         return fast_by(excitations(config, request, mode), facts, options, plant)
     if isinstance(request, SetpointRetune):
-        from loopwright.tuning.fast.setpoint_procedure import setpoint
+        from loopwright.tuning.fast.pulses.procedure import setpoint
 
         return setpoint(facts, request.options)
     from loopwright.service.execution.checkpoints import finished

@@ -28,12 +28,12 @@ from loopwright.service.results import UltimateView, empty_result
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.design_trial import trial
+from loopwright.tuning.fast.design.options import DesignOptions
 from loopwright.tuning.fast.excitation_choice import chosen_stages, fast_by
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.procedure import FAST, FastOptions, FastProposal
+from loopwright.tuning.fast.known_plant.design_trial import trial
+from loopwright.tuning.fast.pulses.procedure import SETPOINT, setpoint
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT, setpoint
+from loopwright.tuning.fast.relay.procedure import FAST, FastOptions, FastProposal
 from loopwright.tuning.five_stage.procedure import PROCEDURE, STAGES, Options, Proposal, five_stage
 from loopwright.tuning.five_stage.ultimate_gain import UltimateResult
 from loopwright.tuning.gains import Gains

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from loopwright.service.jsonable import json_object
 from loopwright.service.results import RESULT, FastResult, FiveStageResult, VerificationView
-from loopwright.tuning.fast.proposal import FastProposal
+from loopwright.tuning.fast.evaluation.proposal import FastProposal
 from loopwright.tuning.five_stage.procedure import Proposal
 
 

@@ -37,12 +37,12 @@ from loopwright.service.inputs.plausible import (
 from loopwright.service.inputs.validation import STRICT, Whole, branch, branch_of, did_you_mean
 from loopwright.tuning.experiments.primitives import Directions
 from loopwright.tuning.experiments.step_limits import not_kept
-from loopwright.tuning.fast.design import MAX_WEIGHT, Aim
-from loopwright.tuning.fast.design_trial import trial_stages
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.procedure import FAST, SWITCHES, FastOptions
+from loopwright.tuning.fast.design.design import MAX_WEIGHT, Aim
+from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.known_plant.design_trial import trial_stages
+from loopwright.tuning.fast.pulses.procedure import SETPOINT
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT
+from loopwright.tuning.fast.relay.procedure import FAST, SWITCHES, FastOptions
 from loopwright.tuning.five_stage.procedure import PROCEDURE, Options, rule_of, stages_of
 from loopwright.tuning.models import FOPDT, SOPDT
 from loopwright.tuning.plan import Mode

@@ -17,13 +17,13 @@ from loopwright.service.states.job_state import ACTIVE
 from loopwright.service.states.loop_state import gains_of, loop_state
 from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.tuning.analysis.assessment import Assessment, assess
-from loopwright.tuning.fast.by_model import BY_MODEL
-from loopwright.tuning.fast.design import Aim, DesignSpec, OptimalGains, aim_of
-from loopwright.tuning.fast.design_trial import designed_on
-from loopwright.tuning.fast.options import weights_up_to
-from loopwright.tuning.fast.procedure import FAST
-from loopwright.tuning.fast.proposal import delayed
-from loopwright.tuning.fast.record_evaluation import evaluate_again
+from loopwright.tuning.fast.design.design import Aim, DesignSpec, OptimalGains, aim_of
+from loopwright.tuning.fast.design.options import weights_up_to
+from loopwright.tuning.fast.evaluation.proposal import delayed
+from loopwright.tuning.fast.evaluation.record_evaluation import evaluate_again
+from loopwright.tuning.fast.known_plant.by_model import BY_MODEL
+from loopwright.tuning.fast.known_plant.design_trial import designed_on
+from loopwright.tuning.fast.relay.procedure import FAST
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Ended, Reason, Refused

@@ -14,12 +14,12 @@ from loopwright.service.results import Figures, GainsView, PerformanceView
 from loopwright.service.states.loop_state import loop_state
 from loopwright.service.store.jobs import Job
 from loopwright.tuning.analysis.comparison import beside, loop_performance
-from loopwright.tuning.fast.design import Aim, DesignSpec, GainDesign
-from loopwright.tuning.fast.design_trial import designed_on
-from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation
-from loopwright.tuning.fast.proposal import delayed
-from loopwright.tuning.fast.requirements import required
-from loopwright.tuning.fast.robustness import known_Ms
+from loopwright.tuning.fast.design.design import Aim, DesignSpec, GainDesign
+from loopwright.tuning.fast.design.requirements import required
+from loopwright.tuning.fast.evaluation.evaluation import MAX_UNCERTAINTY, Evaluation
+from loopwright.tuning.fast.evaluation.proposal import delayed
+from loopwright.tuning.fast.evaluation.robustness import known_Ms
+from loopwright.tuning.fast.known_plant.design_trial import designed_on
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model
 from loopwright.tuning.reasons import ADVICE, Ended, Reason, Refused

@@ -18,9 +18,9 @@ from loopwright.service.results import DESIGNED, FastResult, LoadStepView
 from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.service.store.packed_figures import PackedFigures
 from loopwright.service.store.sample_blocks import Block
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import Evaluation
-from loopwright.tuning.fast.record_evaluation import evaluate_again
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.evaluation import Evaluation
+from loopwright.tuning.fast.evaluation.record_evaluation import evaluate_again
 from loopwright.tuning.reasons import Ended
 
 log = logging.getLogger(__name__)

@@ -30,8 +30,8 @@ from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.observing.observed import observed
 from loopwright.service.observing.resolution import FIRST_S, wall_period_s
 from loopwright.service.store.store import Store
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.options import weights_up_to
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.design.options import weights_up_to
 from loopwright.tuning.models import Reals
 from loopwright.tuning.reasons import Ended
 

@@ -16,8 +16,8 @@ from loopwright.service.states.loop_state import loop_state
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
 from loopwright.tuning.experiments.preflight import PREFLIGHT
-from loopwright.tuning.fast.manual_procedure import MANUAL
-from loopwright.tuning.fast.pulse_levels import RESTED, candidate_models
+from loopwright.tuning.fast.manual.procedure import MANUAL
+from loopwright.tuning.fast.pulses.levels import RESTED, candidate_models
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.structures import INTEGRATOR
 from loopwright.tuning.models import Integrating, Model, Reals

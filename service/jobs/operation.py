@@ -21,9 +21,9 @@ from loopwright.service.observing.packed_plant import pack, unpack
 from loopwright.service.store import job_knowledge
 from loopwright.service.store.jobs import Job, JobEvent
 from loopwright.service.store.store import Store
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
-from loopwright.tuning.fast.known_procedure import TRIAL
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.known_plant.plant import NothingKnown, ObservedPlant
+from loopwright.tuning.fast.known_plant.procedure import TRIAL
 from loopwright.tuning.reasons import Ended
 
 log = logging.getLogger(__name__)

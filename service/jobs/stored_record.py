@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from loopwright.service.store.sample_blocks import COLUMNS, Block
 from loopwright.tuning.analysis.pv_faults import without_wrong_samples
-from loopwright.tuning.fast.manual_procedure import MANUAL
+from loopwright.tuning.fast.evaluation.record_evaluation import first_period
+from loopwright.tuning.fast.manual.procedure import MANUAL
 from loopwright.tuning.fast.record import MIN_LISTENED, MIN_SWITCHES, Excitation, ExperimentRecord, oscillation_period
-from loopwright.tuning.fast.record_evaluation import first_period
 from loopwright.tuning.models import Reals
 from loopwright.tuning.plan import Mode
 

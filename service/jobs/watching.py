@@ -52,7 +52,7 @@ from loopwright.service.store.jobs import Job
 from loopwright.service.store.live_jobs import latest_jobs
 from loopwright.service.store.store import Busy, Store
 from loopwright.service.telemetry.logs import about
-from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.design.design import DesignSpec
 from loopwright.tuning.operation.model_conclusion import ModelState
 from loopwright.tuning.reasons import Ended
 

@@ -59,7 +59,7 @@ from loopwright.service.store.lock import FolderInUse
 from loopwright.service.store.store import Store
 from loopwright.service.telemetry.logs import about
 from loopwright.tuning.fast.excitation_choice import NOT_ASKED
-from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
+from loopwright.tuning.fast.known_plant.plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.plan import Event, Note
 from loopwright.tuning.reasons import Aborted, Ended, Failed, FalsePv, Reason

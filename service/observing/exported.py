@@ -8,7 +8,7 @@ from loopwright.service.jsonable import json_object
 from loopwright.service.observing.observed import OperationView, operation_fields
 from loopwright.service.offline.csv_record.record import Record
 from loopwright.service.results import Figures
-from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.design.design import DesignSpec
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.operation.history import SetpointChange
 from loopwright.tuning.operation.recorded_operation import observe

@@ -16,7 +16,7 @@ from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store.job_knowledge import outdated_until_s
 from loopwright.service.store.store import Store
 from loopwright.service.store.under_test import TimeUnderTest, times_under_test
-from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.design.design import DesignSpec
 
 _ALL = 1_000_000
 """More rows than a history of these times can have."""

@@ -28,12 +28,12 @@ from loopwright.service.results import (
 )
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.analysis.comparison import Comparison, predicted
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import Evaluation
-from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
-from loopwright.tuning.fast.procedure import FAST
-from loopwright.tuning.fast.proposal import comparison_of, identified_model, load_disturbances, ultimate
-from loopwright.tuning.fast.robustness import KnownMs
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.evaluation import Evaluation
+from loopwright.tuning.fast.evaluation.proposal import comparison_of, identified_model, load_disturbances, ultimate
+from loopwright.tuning.fast.evaluation.robustness import KnownMs
+from loopwright.tuning.fast.known_plant.plant import NothingKnown, ObservedPlant
+from loopwright.tuning.fast.relay.procedure import FAST
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.operation.history import SetpointChange
 from loopwright.tuning.operation.known import known_plant

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from loopwright.service.results import GainsView
-from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
+from loopwright.tuning.fast.known_plant.plant import NothingKnown, ObservedPlant
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 
 UNREADABLE = NothingKnown("what was known of the loop as the job began cannot be read again")

@@ -17,7 +17,7 @@ from loopwright.service.jsonable import JsonObject, json_object
 from loopwright.service.offline.recommendation import recommended
 from loopwright.tuning.analysis.assessment import Assessment
 from loopwright.tuning.analysis.step_figures import StepFigures
-from loopwright.tuning.fast.tuned import METHODS, method_of, tune
+from loopwright.tuning.fast.known_plant.tuned import METHODS, method_of, tune
 from loopwright.tuning.gains import Gains, to_parallel
 from loopwright.tuning.models import Model
 from loopwright.tuning.reasons import Ended, Failed, Reason, Refused

@@ -10,16 +10,16 @@ from collections.abc import Sequence
 
 from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequest
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MIN_LISTENED_SAMPLES
+from loopwright.tuning.fast.evaluation.look import MIN_OWN_PERIODS
 from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS
-from loopwright.tuning.fast.look import MIN_OWN_PERIODS
-from loopwright.tuning.fast.manual_procedure import MANUAL
-from loopwright.tuning.fast.manual_procedure import MAX_PERIODS as MAX_PERIODS_IN_MANUAL
-from loopwright.tuning.fast.manual_procedure import MAX_T95 as MAX_T95_IN_MANUAL
-from loopwright.tuning.fast.manual_test import ANSWER_T95, BACK_PULSES, BACK_T95, LONGEST_PULSE_T95, MAX_RAISES
-from loopwright.tuning.fast.procedure import MIN_SAMPLES
-from loopwright.tuning.fast.pulses import MAX_PERIODS as MAX_PERIODS_OF_PULSES
-from loopwright.tuning.fast.pulses import MAX_T95
-from loopwright.tuning.fast.relay_test import MAX_PERIODS
+from loopwright.tuning.fast.manual.manual_test import ANSWER_T95, BACK_PULSES, BACK_T95, LONGEST_PULSE_T95, MAX_RAISES
+from loopwright.tuning.fast.manual.procedure import MANUAL
+from loopwright.tuning.fast.manual.procedure import MAX_PERIODS as MAX_PERIODS_IN_MANUAL
+from loopwright.tuning.fast.manual.procedure import MAX_T95 as MAX_T95_IN_MANUAL
+from loopwright.tuning.fast.pulses.stage import MAX_PERIODS as MAX_PERIODS_OF_PULSES
+from loopwright.tuning.fast.pulses.stage import MAX_T95
+from loopwright.tuning.fast.relay.procedure import MIN_SAMPLES
+from loopwright.tuning.fast.relay.relay_test import MAX_PERIODS
 
 PU_OF_T95 = (0.07, 0.95)
 """Ultimate period as a fraction of T95: the range of eight in ten of 116 self-regulating plants."""

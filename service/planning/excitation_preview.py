@@ -11,12 +11,12 @@ from loopwright.service.inputs.request import RetuneRequest, excitations
 from loopwright.service.results import KnowledgeView
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
-from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY
+from loopwright.tuning.fast.evaluation.evaluation import MAX_UNCERTAINTY
 from loopwright.tuning.fast.experiment import on_trial
 from loopwright.tuning.fast.information import Expected, Moved, expected
-from loopwright.tuning.fast.pulse_test import pulse_size
+from loopwright.tuning.fast.pulses.pulse_test import pulse_size
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.relay_test import BIAS, FIRST_AMPLITUDE, max_amplitude
+from loopwright.tuning.fast.relay.relay_test import BIAS, FIRST_AMPLITUDE, max_amplitude
 from loopwright.tuning.plan import Mode
 
 _WHEN = {

@@ -7,8 +7,8 @@ import math
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.primitives import Directions, Facts
-from loopwright.tuning.fast.procedure import FAST
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT
+from loopwright.tuning.fast.pulses.procedure import SETPOINT
+from loopwright.tuning.fast.relay.procedure import FAST
 
 TIME_BUDGET_T95 = {FAST: 100.0, SETPOINT: 100.0}
 OTHER_BUDGET_T95 = 500.0

@@ -15,15 +15,15 @@ from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequest, SetpointRetune, excitations
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
-from loopwright.tuning.fast.design_trial import trial_stages
 from loopwright.tuning.fast.excitation_choice import chosen_stages
-from loopwright.tuning.fast.manual_procedure import MANUAL
-from loopwright.tuning.fast.manual_sizes import first_pulse, largest_pulse
-from loopwright.tuning.fast.manual_test import LONGEST_PULSE_T95
-from loopwright.tuning.fast.pulse_test import pulse_size
+from loopwright.tuning.fast.known_plant.design_trial import trial_stages
+from loopwright.tuning.fast.manual.manual_test import LONGEST_PULSE_T95
+from loopwright.tuning.fast.manual.procedure import MANUAL
+from loopwright.tuning.fast.manual.sizes import first_pulse, largest_pulse
+from loopwright.tuning.fast.pulses.procedure import setpoint_stages
+from loopwright.tuning.fast.pulses.pulse_test import pulse_size
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.relay_test import BIAS, FIRST_AMPLITUDE, MAX_OUTPUT_RANGE, MAX_RAISE, max_amplitude
-from loopwright.tuning.fast.setpoint_procedure import setpoint_stages
+from loopwright.tuning.fast.relay.relay_test import BIAS, FIRST_AMPLITUDE, MAX_OUTPUT_RANGE, MAX_RAISE, max_amplitude
 from loopwright.tuning.five_stage.procedure import stages_of
 from loopwright.tuning.five_stage.ultimate_gain import RUN_MV_LIMIT
 from loopwright.tuning.gains import Gains

@@ -24,7 +24,7 @@ from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MAX_AWAY, MAX_
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.ramp import check_ramp
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.relay_test import BIAS, max_amplitude
+from loopwright.tuning.fast.relay.relay_test import BIAS, max_amplitude
 from loopwright.tuning.models import sign
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import ADVICE, Ended, Reason, Refused

@@ -131,9 +131,9 @@ _OF_JOBS = (
     "loopwright.service.execution.result",
     "loopwright.service.execution.runner",
     "loopwright.service.loops.bus_loop",
-    "loopwright.tuning.fast.design_trial",
+    "loopwright.tuning.fast.known_plant.design_trial",
     "loopwright.tuning.fast.excitation_choice",
-    "loopwright.tuning.fast.setpoint_procedure",
+    "loopwright.tuning.fast.pulses.procedure",
     "loopwright.tuning.five_stage.procedure",
 )
 """What is imported where it is used, and used by jobs."""

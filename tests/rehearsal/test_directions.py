@@ -16,12 +16,12 @@ from loopwright.service.execution.runner import RunResult, run
 from loopwright.service.jobs.stored_record import moves_of, stored_record
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.primitives import Directions, Facts
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.proposal import FastProposal
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.evaluation.proposal import FastProposal
+from loopwright.tuning.fast.evaluation.record_evaluation import evaluate_again
+from loopwright.tuning.fast.pulses.procedure import setpoint
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.record_evaluation import evaluate_again
-from loopwright.tuning.fast.setpoint_procedure import setpoint
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.plan import Mode, Sample

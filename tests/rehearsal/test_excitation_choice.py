@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from loopwright.service.jobs.stored_record import stored_record
-from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.record_evaluation import evaluate_again
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.record_evaluation import evaluate_again
 from loopwright.tuning.plan import Event, Mode, Note, Sample, StageStarted
 from tests.rehearsal.test_fast import true_Ms
 from tests.rehearsal.test_setpoint import under

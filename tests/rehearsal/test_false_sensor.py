@@ -7,9 +7,9 @@ import pytest
 
 from benchmarks.false_sensor import METHODS, RULE_PLANTS, Case, measured, true_sensor
 from loopwright.plantsim.sensors import SensorFault
-from loopwright.tuning.fast.manual_procedure import MANUAL
-from loopwright.tuning.fast.procedure import FAST
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT
+from loopwright.tuning.fast.manual.procedure import MANUAL
+from loopwright.tuning.fast.pulses.procedure import SETPOINT
+from loopwright.tuning.fast.relay.procedure import FAST
 from loopwright.tuning.five_stage.procedure import PROCEDURE
 from loopwright.tuning.reasons import FalsePv
 

@@ -20,10 +20,10 @@ from loopwright.service.observing.packed_plant import pack, unpack
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.experiments.primitives import Directions, Facts
 from loopwright.tuning.fast.excitation_choice import fast_by
-from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
-from loopwright.tuning.fast.known_procedure import TrialFigures
-from loopwright.tuning.fast.procedure import FastOptions, FastProposal
+from loopwright.tuning.fast.known_plant.plant import NothingKnown, ObservedPlant
+from loopwright.tuning.fast.known_plant.procedure import TrialFigures
 from loopwright.tuning.fast.record import Excitation
+from loopwright.tuning.fast.relay.procedure import FastOptions, FastProposal
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.means import means_alike
 from loopwright.tuning.models import FOPDT, TransferFunction

@@ -19,7 +19,7 @@ from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store import job_knowledge, knowledge
 from loopwright.service.store.jobs import Job
 from loopwright.service.store.store import Store
-from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
+from loopwright.tuning.fast.known_plant.plant import NothingKnown, ObservedPlant
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.operation.known import known_plant

@@ -11,11 +11,11 @@ import pytest
 
 from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.jobs.stored_record import stored_record
-from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.record_evaluation import evaluate_again
 from loopwright.tuning.fast.experiment import Experiment
-from loopwright.tuning.fast.manual_test import CAME_BACK
+from loopwright.tuning.fast.manual.manual_test import CAME_BACK
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.record_evaluation import evaluate_again
 from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, SetOutput, StageStarted
 from tests.rehearsal.test_fast import PLANTS, spec, true_Ms
 from tests.rehearsal.test_setpoint import under

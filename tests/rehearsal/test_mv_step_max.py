@@ -9,7 +9,7 @@ import pytest
 
 from loopwright.tuning.fast import excitation_choice
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.relay_test import BIAS
+from loopwright.tuning.fast.relay.relay_test import BIAS
 from loopwright.tuning.plan import Sample
 from tests.rehearsal.test_fast import true_Ms
 from tests.rehearsal.test_setpoint import under

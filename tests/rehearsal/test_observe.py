@@ -15,9 +15,9 @@ from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.observing.observed import operation_fields
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.controller_check import check_controller
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.known_plant import NothingKnown
-from loopwright.tuning.fast.valve_faults import stiction
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.known_plant.plant import NothingKnown
+from loopwright.tuning.fast.score_tests.valve_faults import stiction
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, Reals, TransferFunction
 from loopwright.tuning.operation.history import SetpointChange, Stretch

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.controllers import PLANTS, measure
-from loopwright.tuning.fast.procedure import FAST
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT
+from loopwright.tuning.fast.pulses.procedure import SETPOINT
+from loopwright.tuning.fast.relay.procedure import FAST
 
 
 @pytest.mark.parametrize("method", [FAST, SETPOINT])

@@ -11,8 +11,8 @@ from benchmarks.refusals import cases, draw, rehearsed
 from loopwright.service.cli.rehearsed import RehearsedJob, shown_samples
 from loopwright.service.execution.rehearsed import RehearsalRecord
 from loopwright.service.jobs.stored_record import stored_record
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.record_evaluation import evaluate_again
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.record_evaluation import evaluate_again
 from loopwright.tuning.reasons import ADVICE, Reason
 
 PAGE = (Path(__file__).parents[2] / "docs" / "refusals.md").read_text(encoding="utf-8")

@@ -18,7 +18,7 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.server.assembly import make_jobs
 from loopwright.service.store.store import Store
 from loopwright.tuning.experiments.preflight import SETTLE
-from loopwright.tuning.fast.procedure import FAST_STAGES
+from loopwright.tuning.fast.relay.procedure import FAST_STAGES
 from loopwright.tuning.five_stage.procedure import STAGES
 from loopwright.tuning.plan import Command, Sample
 from tests.unit.service.fakes import ThreadEngine

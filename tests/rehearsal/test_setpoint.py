@@ -9,9 +9,9 @@ import pytest
 
 from loopwright.service.jobs.stored_record import stored_record
 from loopwright.tuning.analysis.margins import ultimate_point
-from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.record_evaluation import evaluate_again
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.record_evaluation import evaluate_again
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.plan import Event, Mode, Sample, StageStarted
 from tests.rehearsal.test_fast import PLANTS, spec, true_Ms

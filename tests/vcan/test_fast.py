@@ -15,7 +15,7 @@ from loopwright.service.execution.runner import run
 from loopwright.service.loops.bus_loop import BusLoop
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.procedure import FastOptions, fast
+from loopwright.tuning.fast.relay.procedure import FastOptions, fast
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
 from tests.vcan.test_bus_loop import CONTROLLER, PLANT, Start, start, url  # noqa: F401

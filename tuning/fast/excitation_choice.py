@@ -15,15 +15,15 @@ from __future__ import annotations
 from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.ramp import ramped
 from loopwright.tuning.experiments.settle import after_settling
-from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
-from loopwright.tuning.fast.known_procedure import KNOWN_STAGES, TRIAL, ObservedPlantFails, by_known_plant
-from loopwright.tuning.fast.manual_procedure import MANUAL, MANUAL_STAGES, by_manual
-from loopwright.tuning.fast.procedure import FAST, FastOptions, by_relay, fast_by_relay
-from loopwright.tuning.fast.proposal import FastProposal
-from loopwright.tuning.fast.pulse_test import PulseTest
+from loopwright.tuning.fast.evaluation.proposal import FastProposal
+from loopwright.tuning.fast.known_plant.plant import NothingKnown, ObservedPlant
+from loopwright.tuning.fast.known_plant.procedure import KNOWN_STAGES, TRIAL, ObservedPlantFails, by_known_plant
+from loopwright.tuning.fast.manual.procedure import MANUAL, MANUAL_STAGES, by_manual
+from loopwright.tuning.fast.pulses.procedure import SETPOINT_STAGES, TooLittleExcited, by_pulses
+from loopwright.tuning.fast.pulses.pulse_test import PulseTest
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.relay_test import BIAS, RelayTest
-from loopwright.tuning.fast.setpoint_procedure import SETPOINT_STAGES, TooLittleExcited, by_pulses
+from loopwright.tuning.fast.relay.procedure import FAST, FastOptions, by_relay, fast_by_relay
+from loopwright.tuning.fast.relay.relay_test import BIAS, RelayTest
 from loopwright.tuning.plan import Note, Plan
 from loopwright.tuning.reasons import Reason, Refused
 

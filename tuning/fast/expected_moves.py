@@ -12,16 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
+from loopwright.tuning.fast.evaluation.record_evaluation import first_period
 from loopwright.tuning.fast.experiment import Experiment
-from loopwright.tuning.fast.known_procedure import TRIAL, KnownTrial
-from loopwright.tuning.fast.manual_procedure import MANUAL, MAX_PERIODS, MORE_REST, REST, WIDTHS
-from loopwright.tuning.fast.manual_test import ManualTest
-from loopwright.tuning.fast.procedure import MIN_SAMPLES, SWITCHES, FastOptions
-from loopwright.tuning.fast.pulse_test import PulseTest
-from loopwright.tuning.fast.pulses import turn_down, turn_up
+from loopwright.tuning.fast.known_plant.procedure import TRIAL, KnownTrial
+from loopwright.tuning.fast.manual.manual_test import ManualTest
+from loopwright.tuning.fast.manual.procedure import MANUAL, MAX_PERIODS, MORE_REST, REST, WIDTHS
+from loopwright.tuning.fast.pulses.pulse_test import PulseTest
+from loopwright.tuning.fast.pulses.stage import turn_down, turn_up
 from loopwright.tuning.fast.record import Excitation, noise_of
-from loopwright.tuning.fast.record_evaluation import first_period
-from loopwright.tuning.fast.relay_test import RelayTest
+from loopwright.tuning.fast.relay.procedure import MIN_SAMPLES, SWITCHES, FastOptions
+from loopwright.tuning.fast.relay.relay_test import RelayTest
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model, TransferFunction
 from loopwright.tuning.plan import Mode, Plan, Sample, StageStarted

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.tuning.analysis.margins import ultimate_point
-from loopwright.tuning.fast.design import frequencies
-from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY
+from loopwright.tuning.fast.design.design import frequencies
+from loopwright.tuning.fast.design.uncertainty import STANDARD_DEVIATIONS, peak
+from loopwright.tuning.fast.evaluation.evaluation import MAX_UNCERTAINTY
 from loopwright.tuning.fast.experiment import VERIFICATION_PERIODS
 from loopwright.tuning.fast.forecast import Past, forecast, oscillation, pv_of
-from loopwright.tuning.fast.pulse_levels import CAME_BACK, FOLLOWED_TO_ONE_SIDE, MIN_FOLLOWED
+from loopwright.tuning.fast.pulses.levels import CAME_BACK, FOLLOWED_TO_ONE_SIDE, MIN_FOLLOWED
 from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.uncertainty import STANDARD_DEVIATIONS, peak
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Model, Reals, TransferFunction, sign
 from loopwright.tuning.reasons import Ended

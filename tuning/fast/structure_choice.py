@@ -12,8 +12,8 @@ from functools import partial, reduce
 
 import numpy as np
 
+from loopwright.tuning.fast.design.uncertainty import durbin_watson_ratio, unknown_columns
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
-from loopwright.tuning.fast.uncertainty import durbin_watson_ratio, unknown_columns
 from loopwright.tuning.identification.disturbances import (
     by_bic,
     disturbance_candidates,

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopwright.tuning.analysis.zero_order_hold import pulses
-from loopwright.tuning.fast.design import controller
-from loopwright.tuning.fast.uncertainty import filter_ratio
+from loopwright.tuning.fast.design.design import controller
+from loopwright.tuning.fast.design.uncertainty import filter_ratio
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Complexes, Reals, TransferFunction, monic, sign
 

@@ -16,9 +16,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from loopwright.tuning.fast.evaluation import NEGLIGIBLE_RESIDUAL
+from loopwright.tuning.fast.design.uncertainty import durbin_watson_ratio
+from loopwright.tuning.fast.evaluation.evaluation import NEGLIGIBLE_RESIDUAL
 from loopwright.tuning.fast.record import noise_of
-from loopwright.tuning.fast.uncertainty import durbin_watson_ratio
 from loopwright.tuning.identification.output_error import averaged
 from loopwright.tuning.models import Reals, TransferFunction
 from loopwright.tuning.operation.accepted_model import AcceptedModel, answers_to_step, driven

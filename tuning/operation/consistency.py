@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from loopwright.tuning.fast.evaluation import NEGLIGIBLE_RESIDUAL
+from loopwright.tuning.fast.design.uncertainty import durbin_watson_ratio
+from loopwright.tuning.fast.evaluation.evaluation import NEGLIGIBLE_RESIDUAL
 from loopwright.tuning.fast.record import ExperimentRecord
-from loopwright.tuning.fast.uncertainty import durbin_watson_ratio
 from loopwright.tuning.identification.disturbances import answers_to_load, by_bic, fit_structures
 from loopwright.tuning.identification.output_error import UNDISTURBED, Fit, Fitted
 from loopwright.tuning.models import Reals

@@ -15,8 +15,8 @@ from operator import itemgetter
 import numpy as np
 
 from loopwright.tuning.fast.record import ExperimentRecord
-from loopwright.tuning.fast.score_tests import STANDARD_DEVIATIONS, ScoreTests
-from loopwright.tuning.fast.valve_faults import FAULTS, Fault, backlash, stiction
+from loopwright.tuning.fast.score_tests.score_tests import STANDARD_DEVIATIONS, ScoreTests
+from loopwright.tuning.fast.score_tests.valve_faults import FAULTS, Fault, backlash, stiction
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN
 from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.models import Reals, TransferFunction

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
+from loopwright.tuning.fast.known_plant.plant import NothingKnown, ObservedPlant
 from loopwright.tuning.models import Reals
 from loopwright.tuning.operation.observation import Observation
 

@@ -16,14 +16,14 @@ import numpy as np
 
 from loopwright.tuning.analysis.margins import ultimate_point
 from loopwright.tuning.experiments.control_record import ControlPiece, ControlRecord, rows_without_limit
-from loopwright.tuning.fast.controller_effect import with_controller
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation, evaluate
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.controller_effect import with_controller
+from loopwright.tuning.fast.evaluation.evaluation import MAX_UNCERTAINTY, Evaluation, evaluate
+from loopwright.tuning.fast.evaluation.record_evaluation import PERIOD_IS_RIGHT, first_period
+from loopwright.tuning.fast.evaluation.robustness import KnownMs, known_Ms
 from loopwright.tuning.fast.record import LONGEST_DEAD_TIME, MIN_LISTENED, Excitation, ExperimentRecord, noise_of
-from loopwright.tuning.fast.record_evaluation import PERIOD_IS_RIGHT, first_period
-from loopwright.tuning.fast.robustness import KnownMs, known_Ms
-from loopwright.tuning.fast.score_tests import STANDARD_DEVIATIONS, ScoreTests, since
-from loopwright.tuning.fast.what_hides import OF_THE_RECORD, of_pv
+from loopwright.tuning.fast.score_tests.score_tests import STANDARD_DEVIATIONS, ScoreTests, since
+from loopwright.tuning.fast.score_tests.what_hides import OF_THE_RECORD, of_pv
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.disturbances import MIN_BIC_GAIN
 from loopwright.tuning.operation.consistency import consistent

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from loopwright.tuning.fast.design import frequencies
-from loopwright.tuning.fast.evaluation import Evaluation
+from loopwright.tuning.fast.design.design import frequencies
+from loopwright.tuning.fast.design.uncertainty import filter_ratio, peak, uncertainty_of_Ms
+from loopwright.tuning.fast.evaluation.evaluation import Evaluation
+from loopwright.tuning.fast.evaluation.robustness import KnownMs, known_Ms
 from loopwright.tuning.fast.record import ExperimentRecord
-from loopwright.tuning.fast.robustness import KnownMs, known_Ms
-from loopwright.tuning.fast.uncertainty import filter_ratio, peak, uncertainty_of_Ms
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.models import TransferFunction

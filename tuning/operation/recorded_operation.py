@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 from loopwright.tuning.analysis.comparison import Comparison
 from loopwright.tuning.analysis.notebook import as_html
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import Evaluation
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.proposal import comparison_of
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.evaluation.evaluation import Evaluation
+from loopwright.tuning.fast.evaluation.proposal import comparison_of
 from loopwright.tuning.gains import AnyGains, Gains, as_gains
 from loopwright.tuning.identification.record import column, sample_time
 from loopwright.tuning.models import Model

@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from loopwright.tuning.analysis.step_response import step_response
-from loopwright.tuning.fast.design import frequencies
-from loopwright.tuning.fast.evaluation import Evaluation
-from loopwright.tuning.fast.proposal import delayed
+from loopwright.tuning.fast.design.design import frequencies
+from loopwright.tuning.fast.design.uncertainty import distance_from_instability, unknown_columns
+from loopwright.tuning.fast.evaluation.evaluation import Evaluation
+from loopwright.tuning.fast.evaluation.proposal import delayed
 from loopwright.tuning.fast.record import ExperimentRecord
-from loopwright.tuning.fast.uncertainty import distance_from_instability, unknown_columns
 from loopwright.tuning.identification.output_error import Fit, Fitted
 from loopwright.tuning.identification.sensitivity import sensitivities
 from loopwright.tuning.models import Reals, TransferFunction, sign

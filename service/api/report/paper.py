@@ -31,7 +31,7 @@ from loopwright.service.states.job_state import JobState
 from loopwright.service.store.jobs import JobEvent
 from loopwright.service.store.sample_blocks import Block
 from loopwright.tuning.analysis.comparison import beside
-from loopwright.tuning.fast.proposal import delayed
+from loopwright.tuning.fast.evaluation.proposal import delayed
 from loopwright.tuning.gains import Gains
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from loopwright.service.results import EvidenceView
 from loopwright.tuning.analysis.assessment import Assessment, assess
 from loopwright.tuning.analysis.step_figures import StepFigures
 from loopwright.tuning.analysis.step_response import Response, step_response
-from loopwright.tuning.fast.proposal import delayed
+from loopwright.tuning.fast.evaluation.proposal import delayed
 from loopwright.tuning.fast.structure_choice import choose_structure
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.identification.output_error import Fit, averaged

@@ -14,8 +14,8 @@ LOADED = (
     "loopwright.service.execution.rehearsal",
     "loopwright.service.observing.observed",
     "loopwright.service.offline.tunings",
-    "loopwright.tuning.fast.procedure",
-    "loopwright.tuning.fast.design_trial",
+    "loopwright.tuning.fast.relay.procedure",
+    "loopwright.tuning.fast.known_plant.design_trial",
     "loopwright.tuning.five_stage.procedure",
 )
 

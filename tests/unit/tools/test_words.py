@@ -49,8 +49,8 @@ EXTERNAL = {"least_squares"}
 """Names of other libraries."""
 KEPT = {
     ("tuning/experiments/step_test.py", "mv_span"),  # a key of stored results
-    ("tuning/fast/proposal.py", "span"),  # a key of stored results
-    ("tuning/fast/relay_test.py", "span"),
+    ("tuning/fast/evaluation/proposal.py", "span"),  # a key of stored results
+    ("tuning/fast/relay/relay_test.py", "span"),
     ("tuning/analysis/comparison.py", "verdict"),  # a key of stored results
     ("tuning/operation/recorded_operation.py", "verdict"),
 }

@@ -17,7 +17,7 @@ from loopwright.service.offline.tunings import tunings
 from loopwright.service.planning.found_model import DISPROVED
 from loopwright.service.results import ModelView
 from loopwright.tuning.analysis.margins import margins
-from loopwright.tuning.fast.design import Aim
+from loopwright.tuning.fast.design.design import Aim
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, SOPDT, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
@@ -132,7 +132,7 @@ def test_unstable_gains_are_not_to_be_tried(
     service: Service, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from loopwright.tuning.analysis.assessment import assess
-    from loopwright.tuning.fast import tuned as module
+    from loopwright.tuning.fast.known_plant import tuned as module
 
     # a hundred times the gains that the method found
     monkeypatch.setattr(module, "realisable", lambda gains, _filter: (Gains(100.0 * gains.Kp, gains.Ti), ()))

@@ -24,7 +24,7 @@ from loopwright.service.store import knowledge
 from loopwright.service.store.clock import stamp
 from loopwright.service.store.job_rows import find
 from loopwright.tuning.analysis.margins import margins
-from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.design.design import DesignSpec
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Reason

@@ -17,7 +17,7 @@ from typer.testing import CliRunner, Result
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.service.cli.main import app
 from loopwright.tuning.analysis.margins import margins
-from loopwright.tuning.fast.tuned import METHODS
+from loopwright.tuning.fast.known_plant.tuned import METHODS
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Reals, TransferFunction
 from loopwright.tuning.reasons import Reason

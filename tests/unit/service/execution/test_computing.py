@@ -97,7 +97,7 @@ class TestPool:
     def test_it_finds_everything_loaded(self, pool: Pool) -> None:
         wanted = {
             "loopwright.tuning.five_stage.procedure",
-            "loopwright.tuning.fast.design_trial",
+            "loopwright.tuning.fast.known_plant.design_trial",
             "loopwright.service.offline.tunings",
             "loopwright.service.jobs.alternatives",
             "loopwright.service.execution.rehearsal",

@@ -12,9 +12,9 @@ from pydantic import ValidationError
 from loopwright.service.inputs.request import FastRetune, FiveStageRetune, RuleRetune, retune_request
 from loopwright.service.inputs.validation import lines, place
 from loopwright.service.jobs.fleet import FastRetunes, FiveStageRetunes, RuleRetunes, fleet_request
-from loopwright.tuning.fast.design import Aim, DesignSpec
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.procedure import FastOptions
+from loopwright.tuning.fast.design.design import Aim, DesignSpec
+from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.relay.procedure import FastOptions
 from loopwright.tuning.five_stage.procedure import Options
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating
 from loopwright.tuning.rules.registry import METHODS

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from loopwright.service.inputs.config import ConfigError, LoopConfig, parse_site
 from loopwright.service.inputs.request import BadLimits, DesignRetune, retune_request, within
-from loopwright.tuning.fast.design import WEIGHTS
+from loopwright.tuning.fast.design.design import WEIGHTS
 
 ENTRY = {
     "tag": "TIC-1", "bus": "virtual:x", "controller_node": 0x20, "pv_unit": "degC",

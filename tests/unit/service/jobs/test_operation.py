@@ -15,8 +15,8 @@ from loopwright.service.jobs.operation import OperationHeard, outdated_by
 from loopwright.service.listening.rings import Rings
 from loopwright.service.store import job_knowledge, knowledge
 from loopwright.service.store.jobs import Job, JobEvent
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.known_plant import NothingKnown, ObservedPlant
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.known_plant.plant import NothingKnown, ObservedPlant
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.fakes import TAG, Service
 from tests.unit.service.jobs.test_looking import MOVES, PoolInThisProcess

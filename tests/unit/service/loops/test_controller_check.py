@@ -19,10 +19,10 @@ from loopwright.tuning.experiments import controller_check
 from loopwright.tuning.experiments.control_record import ControlRecord
 from loopwright.tuning.experiments.controller_check import ControllerCheck, check_controller
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.procedure import FastOptions, fast
-from loopwright.tuning.fast.proposal import FastProposal
-from loopwright.tuning.fast.setpoint_procedure import setpoint
+from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.evaluation.proposal import FastProposal
+from loopwright.tuning.fast.pulses.procedure import setpoint
+from loopwright.tuning.fast.relay.procedure import FastOptions, fast
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Plan
 from loopwright.tuning.reasons import Reason
@@ -30,7 +30,7 @@ from tests.unit.service.bus_site import FOUND, Site, TunerBus
 
 T95_S, STEP = 32.0, 0.1
 NOISE = 0.001
-USERS = ("loopwright.tuning.experiments.controller_mismatch", "loopwright.tuning.fast.controller_effect")
+USERS = ("loopwright.tuning.experiments.controller_mismatch", "loopwright.tuning.fast.evaluation.controller_effect")
 
 
 @contextmanager

@@ -17,9 +17,9 @@ from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.manual_procedure import by_manual
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.proposal import FastProposal
+from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.evaluation.proposal import FastProposal
+from loopwright.tuning.fast.manual.procedure import by_manual
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.plan import Command, Event, Sample, StageStarted
 from loopwright.tuning.reasons import Reason

@@ -16,9 +16,9 @@ from loopwright.service.execution.guard import RunLimits
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.tuning.analysis.margins import margins
 from loopwright.tuning.experiments.primitives import Directions, Facts
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.proposal import FastProposal
-from loopwright.tuning.fast.setpoint_procedure import setpoint
+from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.evaluation.proposal import FastProposal
+from loopwright.tuning.fast.pulses.procedure import setpoint
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT
 from loopwright.tuning.plan import Command, Event, Sample, StageStarted

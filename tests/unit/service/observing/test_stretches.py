@@ -8,7 +8,7 @@ import pytest
 from loopwright.service.listening.bins import GAP_BEFORE, SAMPLE, Bins, Rows, merged, of_samples
 from loopwright.service.observing.resolution import FIRST_S, resolution, wall_period_s
 from loopwright.service.observing.stretches import heard_stretches
-from loopwright.tuning.fast.design import DesignSpec
+from loopwright.tuning.fast.design.design import DesignSpec
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.operation.observation import observe
 from tests.unit.service.observing.operated import Operated

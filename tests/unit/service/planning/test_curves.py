@@ -20,8 +20,8 @@ from loopwright.service.jobs.alternatives import redesigned
 from loopwright.service.planning.curves import LOAD_PCT, LoopCurves, horizons, loop_curves
 from loopwright.service.results import FastResult, GainsView, TransferModelView
 from loopwright.service.states.job_state import JobState
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.design_trial import designed_on
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.known_plant.design_trial import designed_on
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.plan import Mode

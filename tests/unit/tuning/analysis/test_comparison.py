@@ -18,9 +18,9 @@ from loopwright.tuning.analysis.comparison import (
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.analysis.step_response import step_figures
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.design_trial import designed_on
-from loopwright.tuning.fast.procedure import FastOptions
-from loopwright.tuning.fast.proposal import comparison_on
+from loopwright.tuning.fast.evaluation.proposal import comparison_on
+from loopwright.tuning.fast.known_plant.design_trial import designed_on
+from loopwright.tuning.fast.relay.procedure import FastOptions
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, Integrating, Model
 from loopwright.tuning.rules.design import comparison_of, design

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from loopwright.plantsim.plant import LinearPlant
-from loopwright.tuning.fast.changing_gain import find_changing_gain
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import evaluate
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.evaluation import evaluate
 from loopwright.tuning.fast.record import ExperimentRecord
+from loopwright.tuning.fast.score_tests.changing_gain import find_changing_gain
 from loopwright.tuning.fast.structure_choice import RIVAL_BIC, choose_structure
 from loopwright.tuning.identification.output_error import Fit
 from loopwright.tuning.models import Reals

@@ -14,10 +14,10 @@ from loopwright.tuning.experiments.control_law import ControlLaw
 from loopwright.tuning.experiments.control_record import ControlPiece, ControlRecord
 from loopwright.tuning.experiments.controller_check import check_controller
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.controller_effect import Ms_instead, mismatch, note_of, with_controller
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import Evaluation, evaluate
-from loopwright.tuning.fast.outcome import refusal_of
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.controller_effect import Ms_instead, mismatch, note_of, with_controller
+from loopwright.tuning.fast.evaluation.evaluation import Evaluation, evaluate
+from loopwright.tuning.fast.evaluation.outcome import refusal_of
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction

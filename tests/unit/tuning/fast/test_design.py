@@ -10,9 +10,9 @@ import pytest
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.analysis.stability import is_stable
 from loopwright.tuning.analysis.step_response import step_figures
-from loopwright.tuning.fast.design import DesignSpec, GainDesign, controller, frequencies
-from loopwright.tuning.fast.gain_bounds import does_not_encircle, largest_gains
-from loopwright.tuning.fast.iae import LoopCost
+from loopwright.tuning.fast.design.design import DesignSpec, GainDesign, controller, frequencies
+from loopwright.tuning.fast.design.gain_bounds import does_not_encircle, largest_gains
+from loopwright.tuning.fast.design.iae import LoopCost
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction, sign
 from loopwright.tuning.reasons import Reason, Refused

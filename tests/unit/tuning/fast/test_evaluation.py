@@ -9,10 +9,10 @@ import pytest
 from scipy.signal import lfilter
 
 from loopwright.tuning.analysis.margins import margins
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import evaluate
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.design.uncertainty import peak, seen_covariance
+from loopwright.tuning.fast.evaluation.evaluation import evaluate
 from loopwright.tuning.fast.record import Excitation, oscillation_period
-from loopwright.tuning.fast.uncertainty import peak, seen_covariance
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.tuning.fast.records import BENCHES, FIRST, THREE_LAGS, record

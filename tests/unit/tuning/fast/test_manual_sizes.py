@@ -9,7 +9,8 @@ import pytest
 
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.tuning.experiments.primitives import Directions, Facts, OperatingPoint
-from loopwright.tuning.fast.manual_sizes import (
+from loopwright.tuning.fast.manual.self_regulation import comes_to_rest
+from loopwright.tuning.fast.manual.sizes import (
     GROWTH,
     MAY_USE,
     OF_ROOM,
@@ -19,9 +20,8 @@ from loopwright.tuning.fast.manual_sizes import (
     next_pulse,
     pv_bounds,
 )
-from loopwright.tuning.fast.pulse_levels import PulseBounds
+from loopwright.tuning.fast.pulses.levels import PulseBounds
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
-from loopwright.tuning.fast.self_regulation import comes_to_rest
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import Reals
 

@@ -10,8 +10,8 @@ import pytest
 from loopwright.plantsim.plant import LinearPlant
 from loopwright.plantsim.valves import Backlash, EqualPercentage
 from loopwright.tuning.analysis.window import oscillation_at_rest
-from loopwright.tuning.fast.mv_faults import find_mv_fault
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
+from loopwright.tuning.fast.score_tests.mv_faults import find_mv_fault
 from loopwright.tuning.fast.structure_choice import choose_structure
 from loopwright.tuning.identification.output_error import Fit
 from loopwright.tuning.models import Reals

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from loopwright.tuning.fast.forecast import Past, forecast
-from loopwright.tuning.fast.pulse_levels import PulseBounds, candidate_models, last_level, second_level, step_fits
+from loopwright.tuning.fast.pulses.levels import PulseBounds, candidate_models, last_level, second_level, step_fits
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, TransferFunction
 from tests.unit.tuning.fast.test_forecast import TS, simulated

@@ -14,9 +14,9 @@ from loopwright.service.execution.rehearsal import RehearsedLoop
 from loopwright.service.execution.runner import RunResult, run
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.experiments.primitives import Directions, Facts
-from loopwright.tuning.fast.options import DesignOptions
-from loopwright.tuning.fast.proposal import FastProposal, PulseFigures
-from loopwright.tuning.fast.setpoint_procedure import setpoint
+from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.evaluation.proposal import FastProposal, PulseFigures
+from loopwright.tuning.fast.pulses.procedure import setpoint
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
 from loopwright.tuning.plan import Event, Mode, Note, Sample, StageDone

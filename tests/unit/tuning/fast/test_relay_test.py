@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace
-from loopwright.tuning.fast.relay_test import RelayTest
+from loopwright.tuning.fast.relay.relay_test import RelayTest
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode, Sample
 from loopwright.tuning.reasons import Reason, Refused

@@ -15,12 +15,12 @@ from loopwright.tuning.analysis.comparison import Comparison, LoopPerformance, l
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.analysis.step_response import step_response
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.design import MAX_COST_RATIO, MAX_WEIGHT, Aim, DesignSpec, GainDesign, OptimalGains
-from loopwright.tuning.fast.evaluation import evaluate
-from loopwright.tuning.fast.iae import LoopCost
-from loopwright.tuning.fast.proposal import comparison_on
-from loopwright.tuning.fast.requirements import LOWEST_MS, NEARLY, required
-from loopwright.tuning.fast.weight_bounds import KEPT, DesignBounds, movement, weights
+from loopwright.tuning.fast.design.design import MAX_COST_RATIO, MAX_WEIGHT, Aim, DesignSpec, GainDesign, OptimalGains
+from loopwright.tuning.fast.design.iae import LoopCost
+from loopwright.tuning.fast.design.requirements import LOWEST_MS, NEARLY, required
+from loopwright.tuning.fast.design.weight_bounds import KEPT, DesignBounds, movement, weights
+from loopwright.tuning.fast.evaluation.evaluation import evaluate
+from loopwright.tuning.fast.evaluation.proposal import comparison_on
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction, sign
 from loopwright.tuning.reasons import Reason, Refused

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from loopwright.tuning.analysis.margins import margins
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import Evaluation, evaluate
-from loopwright.tuning.fast.robustness import KnownMs, known_Ms
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.evaluation import Evaluation, evaluate
+from loopwright.tuning.fast.evaluation.robustness import KnownMs, known_Ms
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import TransferFunction
 from tests.unit.tuning.fast.records import FIRST, record

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import evaluate
-from loopwright.tuning.fast.score_tests import (
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.evaluation import evaluate
+from loopwright.tuning.fast.score_tests.score_tests import (
     CHANGING_WITH_PV,
     ScoreTests,
     above_rest,

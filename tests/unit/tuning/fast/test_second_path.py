@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from loopwright.tuning.analysis.margins import ultimate_point
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import evaluate
-from loopwright.tuning.fast.second_path import find_second_path
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.evaluation import evaluate
+from loopwright.tuning.fast.score_tests.second_path import find_second_path
 from loopwright.tuning.fast.structure_choice import RIVAL_BIC, choose_structure
 from loopwright.tuning.identification.output_error import Fit
 from loopwright.tuning.reasons import Reason

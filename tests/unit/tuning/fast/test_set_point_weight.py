@@ -12,10 +12,10 @@ from loopwright.tuning.analysis.comparison import Comparison, loop_performance
 from loopwright.tuning.analysis.margins import margins, ultimate_point
 from loopwright.tuning.analysis.step_response import step_figures
 from loopwright.tuning.experiments.primitives import Facts
-from loopwright.tuning.fast.design import MAX_OVERSHOOT, Aim, DesignSpec, GainDesign, aim_of
-from loopwright.tuning.fast.iae import LoopCost, LoopResponses
-from loopwright.tuning.fast.proposal import comparison_on
-from loopwright.tuning.fast.tuned import tune
+from loopwright.tuning.fast.design.design import MAX_OVERSHOOT, Aim, DesignSpec, GainDesign, aim_of
+from loopwright.tuning.fast.design.iae import LoopCost, LoopResponses
+from loopwright.tuning.fast.evaluation.proposal import comparison_on
+from loopwright.tuning.fast.known_plant.tuned import tune
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.models import FOPDT, TransferFunction, sign
 from loopwright.tuning.reasons import Reason, Refused

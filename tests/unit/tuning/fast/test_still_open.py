@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import pytest
 
-from loopwright.tuning.fast.design import DesignSpec
-from loopwright.tuning.fast.evaluation import MAX_UNCERTAINTY, Evaluation, evaluate
-from loopwright.tuning.fast.record import Excitation
-from loopwright.tuning.fast.still_open import (
+from loopwright.tuning.fast.design.design import DesignSpec
+from loopwright.tuning.fast.evaluation.evaluation import MAX_UNCERTAINTY, Evaluation, evaluate
+from loopwright.tuning.fast.evaluation.still_open import (
     MAX_UNCERTAINTY_TO_TRY,
     open_by,
     samples_needed,
     trial_may_tell,
 )
+from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.reasons import Reason, Refused
 from tests.unit.tuning.fast.records import FIRST, THREE_LAGS, record
 

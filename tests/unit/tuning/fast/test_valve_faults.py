@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from loopwright.tuning.fast.score_tests.valve_faults import backlash, find_valve_fault, saturation, stiction
 from loopwright.tuning.fast.structure_choice import choose_structure
-from loopwright.tuning.fast.valve_faults import backlash, find_valve_fault, saturation, stiction
 from loopwright.tuning.identification.output_error import Fit
 from tests.unit.tuning.fast.records import BENCHES, record
 

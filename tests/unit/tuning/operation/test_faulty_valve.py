@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopwright.tuning.fast.valve_faults import Fault, backlash, stiction
+from loopwright.tuning.fast.score_tests.valve_faults import Fault, backlash, stiction
 from loopwright.tuning.operation.faulty_valve import followed_by
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from loopwright.tuning.fast.tuned import METHODS as ALL
+from loopwright.tuning.fast.known_plant.tuned import METHODS as ALL
 from loopwright.tuning.models import FOPDT, SOPDT, Integrating, Model, TransferFunction
 from loopwright.tuning.reasons import Reason, Refused
 from loopwright.tuning.rules.registry import METHODS, Method, Option, tune

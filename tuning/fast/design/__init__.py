@@ -1,0 +1,1 @@
+"""From a model to the gains with the least J for a robustness, and how well their Ms is known."""

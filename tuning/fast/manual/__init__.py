@@ -1,0 +1,1 @@
+"""The procedure that moves the manual output by pulses."""

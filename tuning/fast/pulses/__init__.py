@@ -1,0 +1,1 @@
+"""The procedure that moves the set-point by pulses."""

@@ -1,0 +1,1 @@
+"""The procedure that moves MV by a relay."""

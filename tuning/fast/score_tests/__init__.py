@@ -1,0 +1,1 @@
+"""What a linear plant with constant load disturbances leaves unexplained in a record, and what explains it."""
