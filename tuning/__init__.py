@@ -7,12 +7,11 @@
     print(found)                                    # gains, Ms, overshoot
     found.plot().savefig("simc.png")                # a notebook shows it by itself
 
-Models        FOPDT, SOPDT, Integrating, TransferFunction, as_model (from control, scipy.signal, or names: {"K": ...})
-              Whatever takes a model takes each of these, and a result that has one (identify, observe, tune); whatever
-              takes gains takes a result that has some.
-Tuning        tune (by a rule, or as the procedure fast designs: "fast", Ms=1.6), METHODS (every method: what it is
-              for, its source, its options), Tuned, Gains
-              compare (methods, or gains with names, in one table)
+Models        FOPDT, SOPDT, Integrating, TransferFunction, as_model (from control, scipy.signal, or names: {"K": ...});
+              what takes a model takes all of these, and results with a model (of identify, observe, tune)
+Tuning        tune (by a rule, or as the procedure fast designs: "fast", Ms=1.6), compare (methods, or gains with
+              names, in one table), METHODS (every method: what it is for, its source, its options), Tuned, Gains;
+              what takes gains takes results with gains
 Analysis      margins (Ms, gain, phase and delay margin), bode, nyquist, ultimate_point, assess, step_response,
               step_figures
 Reduction     half_rule, moments, two_areas
