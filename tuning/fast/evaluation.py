@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass, replace
 
 from loopwright.tuning.fast.design import DesignSpec, GainDesign, OptimalGains
-from loopwright.tuning.fast.instead_of_loads import instead_of_loads
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
 from loopwright.tuning.fast.requirements import keeping, possible_instead
+from loopwright.tuning.fast.rival_explanations import rival_explanations
 from loopwright.tuning.fast.score_tests import ScoreTests
 from loopwright.tuning.fast.structure_choice import RIVAL_BIC, StructureChoice, choose_structure
 from loopwright.tuning.fast.two_lags import find_two_lags
@@ -223,7 +223,7 @@ def _instead_of_loads(
     next step twice where there is a second path, and a load disturbance stays as it is. Where a gain that changes
     explains the record better, the record is not explained by a linear plant.
     """
-    instead = instead_of_loads(fit, found)
+    instead = rival_explanations(fit, found)
     # a record of one side hardly shows the other one, and its proposal says so
     as_well = MIN_BIC_GAIN if instead is not None and instead.changing and fit.record.one_sided else -RIVAL_BIC
     if instead is None or instead.bic_gain < as_well:
