@@ -53,7 +53,7 @@ STAND_IN = r"""(() => {
   let n = 0;
   const pv = (at_s, loop) => 50 + Math.sin(at_s / (3 + loop % 7));
   const job = (heard, tag, s) => s % 300 < 60 ? [{ id: "0123456789ab", url: "/jobs/0123456789ab", loop: tag,
-    host: heard.hello.host, state: "running", dry_run: true, by: "bench", stage: "relay",
+    gateway: heard.hello.gateway, state: "running", dry_run: true, by: "bench", stage: "relay",
     progress: (s % 300) / 60, remaining_plant_time_s: 60 - s % 300, plant_time_s: s % 300, stopping: false }] : [];
   window.passSeconds = async (seconds, heard) => {
     for (let s = 0; s < seconds; s++) {

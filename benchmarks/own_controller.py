@@ -30,7 +30,7 @@ from loopwright.tuning.experiments.controller_check import EXACT, ControllerChec
 from loopwright.tuning.plan import Command, Sample
 from loopwright.tuning.reasons import Reason
 
-USERS = ("experiments.controller_mismatch", "fast.controller_effect")
+USERS = ("experiments.controller_mismatch", "fast.evaluation.controller_effect")
 EXACT_PV = Case("PI no noise", 0.0)
 BY_RELAY = (
     EXACT_PV,

@@ -60,9 +60,9 @@ _WHERE = {
     "reduction.half_rule": ("half_rule",),
     "reduction.moments_and_areas": ("moments", "two_areas"),
     "rules.registry": ("Method",),
-    "fast.method_comparison": ("MethodComparison", "ComparedGains", "compare"),
+    "fast.known_plant.method_comparison": ("MethodComparison", "ComparedGains", "compare"),
     "operation.recorded_operation": ("Observed", "observe"),
-    "fast.tuned": ("METHODS", "Tuned", "tune"),
+    "fast.known_plant.tuned": ("METHODS", "Tuned", "tune"),
 }
 _HOME = {name: module for module, names in _WHERE.items() for name in names}
 

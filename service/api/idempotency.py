@@ -23,12 +23,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from loopwright.service.api import problems
 from loopwright.service.api.gate.bodies import begins_with
-from loopwright.service.api.gate.places import stops_a_test
+from loopwright.service.api.gate.concurrency import stops_a_test
 from loopwright.service.security.principal import LOCAL
 from loopwright.service.security.principal import current as principal
-from loopwright.service.store import claims
-from loopwright.service.store.claims import Claim, StillAnswering
+from loopwright.service.store import idempotency_effects
 from loopwright.service.store.idempotency import KEPT_H, Answer, IdempotencyKeys, OtherRequest
+from loopwright.service.store.idempotency_effects import Claim, StillAnswering
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -91,11 +91,11 @@ class Idempotent:
         answer: Answer | None = None
         try:
             if claim.effect is None:
-                token = claims.current.set(claim)
+                token = idempotency_effects.current.set(claim)
                 try:
                     answer = await _ask(self._app, scope, begins_with(body, receive))
                 finally:
-                    claims.current.reset(token)
+                    idempotency_effects.current.reset(token)
             else:
                 answer = await self._after_the_cut(claim.effect, scope)
             return answer

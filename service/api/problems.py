@@ -25,8 +25,8 @@ from loopwright.service.inputs.validation import place, words
 from loopwright.service.jobs.journal import temporary
 from loopwright.service.offline.tunings import BadTuning
 from loopwright.service.states.job_state import IllegalMove, JobState
-from loopwright.service.store.claims import StillAnswering
 from loopwright.service.store.damage import is_damage
+from loopwright.service.store.idempotency_effects import StillAnswering
 from loopwright.service.store.job_rows import NoSuchJob
 from loopwright.service.store.lock import FolderInUse
 from loopwright.service.store.store import Busy

@@ -38,7 +38,7 @@ def follow(client: Client, job_url: str, to: Console | None = None) -> JobView:
             match None if form is None else parsed(form, data):
                 case ProgressShown(stage=stage, progress=progress, remaining_plant_time_s=left):
                     text = "" if left is None else f"about {left:.0f} s of plant time left"
-                    bars.update(task, completed=progress, description=stage or "", left=text)
+                    bars.update(task, completed=progress, description=stage_name(stage), left=text)
                 case StageDoneShown(stage=stage, plant_time_s=plant_time_s, result=result):
                     found = stage_found(stage, result, "") or "done"
                     line = f"  {stage_name(stage)}: {found} (after {plant_time_s:.1f} s of plant time)"
@@ -217,4 +217,4 @@ def doing(job: JobView) -> str:
     """Returns the state of a job, with its stage and progress while it runs."""
     if job.state is not JobState.RUNNING:
         return job.state
-    return " ".join(filter(None, (f"{job.state}:", job.stage, f"{job.progress:.0%}")))
+    return " ".join(filter(None, (f"{job.state}:", stage_name(job.stage), f"{job.progress:.0%}")))

@@ -14,6 +14,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from loopwright.service.api.report.words import stage_name
 from loopwright.service.cli.client import Client, parsed
 from loopwright.service.live.messages import LiveJob, LiveJobs, LiveLoopRow, Loops
 
@@ -88,7 +89,7 @@ def _job_words(seen: SeenLoop) -> list[str]:
     if job is None:
         words = ["under test by another tuner"] if seen.row.under_test else []
         return words + (["gains on trial"] if seen.row.on_trial else [])
-    stage = job.stage or job.state
+    stage = stage_name(job.stage) or job.state
     words = [f"job {job.id}: {stage}"]
     if job.progress is not None:
         words[0] += f" {job.progress:.0%}"

@@ -6,6 +6,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from loopwright.service.api.report.words import stage_name
 from loopwright.service.cli.terminal import number
 from loopwright.service.planning.preview import FleetPreview, Preview, duration_text
 
@@ -30,7 +31,7 @@ def _stages(found: Preview, console: Console) -> None:
     table = Table("stage", "MV %", "SP", "PV", "plant time", "what is moved")
     for each in moving:
         table.add_row(
-            each.stage,
+            stage_name(each.stage),
             _range(each.mv_low_pct, each.mv_high_pct, each.mv_move_pct),
             _range(each.sp_low, each.sp_high, each.sp_move),
             "not known" if each.pv_move is None else _range(each.pv_low, each.pv_high, each.pv_move),

@@ -6,9 +6,9 @@ import threading
 from collections.abc import Callable
 
 from loopwright.service.errors import Conflict, Locked
+from loopwright.service.jobs.forwarded_decisions import ForwardedDecisions
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
-from loopwright.service.jobs.passing_on import PassingOn
 from loopwright.service.loops.gain_change import ForeignGains, replace_accepted
 from loopwright.service.observing.accepted_operation import watched
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
@@ -37,11 +37,11 @@ class Decisions:
         directory: LoopDirectory,
         machine: Machine,
         knowledge: KeptKnowledge,
-        passing_on: PassingOn,
+        forwarded_decisions: ForwardedDecisions,
     ) -> None:
         self.store = store
         self._knowledge = knowledge
-        self._passing_on = passing_on
+        self._forwarded_decisions = forwarded_decisions
         self._directory = directory
         self._machine = machine
         # By loop: an event that is set when a decision that writes to its controller has ended.
@@ -105,7 +105,7 @@ class Decisions:
             config, host = self._directory.owner(row.loop)
             if host != self.store.host:  # only the service there can write to it
                 asked = auto_rollback if wanted is JobState.ACCEPTED else None
-                self._passing_on.ask(host, _WHAT[wanted], row.loop, job_id, by, asked)
+                self._forwarded_decisions.ask(host, _WHAT[wanted], row.loop, job_id, by, asked)
                 return self.store.get(job_id)
             old, new = gains_of(row.previous_gains), new_gains(row)
             before, after = (old, new) if wanted is JobState.ACCEPTED else (new, old)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from loopwright.service.errors import Conflict, GatewayLost, NotKnown
 from loopwright.service.jobs.decisions import WRITES_S, Decisions
+from loopwright.service.jobs.forwarded_decisions import ForwardedDecisions
 from loopwright.service.jobs.loop_directory import LoopDirectory
-from loopwright.service.jobs.passing_on import PassingOn
 from loopwright.service.states.job_state import JobState
 from loopwright.service.store import gateways, loop_locks
 from loopwright.service.store.decision_requests import What
@@ -20,11 +20,13 @@ class Locking:
     decisions: decisions that may be writing to a loop of this host.
     """
 
-    def __init__(self, store: Store, directory: LoopDirectory, decisions: Decisions, passing_on: PassingOn) -> None:
+    def __init__(
+        self, store: Store, directory: LoopDirectory, decisions: Decisions, forwarded_decisions: ForwardedDecisions
+    ) -> None:
         self.store = store
         self._directory = directory
         self._decisions = decisions
-        self._passing_on = passing_on
+        self._forwarded_decisions = forwarded_decisions
 
     def lock(self, tag: str, reason: str, by: str) -> tuple[LoopLockRow, Job | None]:
         """Locks a loop: from now on no test starts on it, on any host, and no decision writes to it. Returns the lock,
@@ -48,7 +50,7 @@ class Locking:
     def _wait_for(self, host: str, tag: str, by: str) -> None:
         """Waits until the host of a locked loop says that no decision writes to it. Raises Conflict."""
         try:
-            if self._passing_on.ask(host, What.WRITES_OVER, tag, None, by):
+            if self._forwarded_decisions.ask(host, What.WRITES_OVER, tag, None, by):
                 return
             why = f"gateway {host} does not say that none is"
         except GatewayLost as lost:

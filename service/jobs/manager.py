@@ -18,7 +18,7 @@ from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import DesignRetune, RetuneRequest, check_setpoint_source, within
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.aftercare import Aftercare
-from loopwright.service.jobs.carrying_out import CarryingOut
+from loopwright.service.jobs.database_retries import STOP_PATIENCE_S, DatabaseRetries
 from loopwright.service.jobs.decisions import Decisions
 from loopwright.service.jobs.engine import WORKFLOW_VERSION, Engine
 from loopwright.service.jobs.journal import Journal, temporary
@@ -28,7 +28,7 @@ from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.operation import OperationHeard
 from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
-from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
+from loopwright.service.jobs.requested_decisions import RequestedDecisions
 from loopwright.service.jobs.worker import Worker
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.security.principal import signed
@@ -72,7 +72,7 @@ class Jobs:
         worker: Worker,
         decisions: Decisions,
         locking: Locking,
-        carrying_out: CarryingOut,
+        requested_decisions: RequestedDecisions,
         aftercare: Aftercare,
         recovery: Recovery,
         machine: Machine,
@@ -87,13 +87,13 @@ class Jobs:
         self.worker = worker
         self.decisions = decisions
         self.locking = locking
-        self.carrying_out = carrying_out
+        self.requested_decisions = requested_decisions
         self.aftercare = aftercare
         self.knowledge = knowledge
         self.operation = operation
         self._recovery = recovery
         self._machine = machine
-        self._lasting = UntilAnswered(machine, registry)
+        self._lasting = DatabaseRetries(machine, registry)
         self._watched = self._machine.monotonic()
         self._lost: set[str] = set()
         self._ended = threading.Event()
@@ -135,7 +135,7 @@ class Jobs:
             self._watcher.start()
             if self.store.shared:
                 self._name_holder.start()
-                self.carrying_out.start()
+                self.requested_decisions.start()
             self.aftercare.start()
 
     def reconcile(self, at_once: bool = False) -> None:
@@ -355,7 +355,7 @@ class Jobs:
                     running.job_id, running.tag, ENDS_S,
                 )  # fmt: skip
         self.aftercare.close()
-        self.carrying_out.close()
+        self.requested_decisions.close()
         self.stop_watching()
         if self._watcher.ident is not None:  # a service that never started leaves the jobs as they are
             try:

@@ -28,6 +28,7 @@ from loopwright.service.inputs.request import (
     within,
 )
 from loopwright.service.jobs.active_job import Running
+from loopwright.service.jobs.database_retries import STOP_PATIENCE_S, DatabaseRetries
 from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.loop_model import loop_model
@@ -35,7 +36,6 @@ from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.operation import OperationHeard, outdated_by
 from loopwright.service.jobs.recovery import FALSE_PV_WORDS
 from loopwright.service.jobs.registry import Registry
-from loopwright.service.jobs.until_answered import STOP_PATIENCE_S, UntilAnswered
 from loopwright.service.loops.loop import Loop
 from loopwright.service.loops.observed_loop import ObservedLoop
 from loopwright.service.loops.restoration import restore_abandoned
@@ -100,7 +100,7 @@ class Worker:
         self._tune = tune
         self._rehearse = rehearse
         self._machine = machine
-        self._lasting = UntilAnswered(machine, registry)
+        self._lasting = DatabaseRetries(machine, registry)
 
     def work(self, job_id: str) -> None:
         """Runs a job to its end, or resumes it after a crash. The engine calls it; a job that is over is left alone.

@@ -7,18 +7,18 @@ from collections.abc import Callable, Mapping
 from loopwright.service.execution.procedures import Rehearse, Tune
 from loopwright.service.inputs.config import BusConfig, LoopConfig
 from loopwright.service.jobs.aftercare import Aftercare
-from loopwright.service.jobs.carrying_out import CarryingOut
 from loopwright.service.jobs.decisions import Decisions
 from loopwright.service.jobs.engine import Engine
+from loopwright.service.jobs.forwarded_decisions import ForwardedDecisions
 from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.locking import Locking
 from loopwright.service.jobs.loop_directory import LoopDirectory, LoopFactory
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.operation import OperationHeard
-from loopwright.service.jobs.passing_on import PassingOn
 from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
+from loopwright.service.jobs.requested_decisions import RequestedDecisions
 from loopwright.service.jobs.worker import Worker
 from loopwright.service.observing.kept_knowledge import KeptKnowledge
 from loopwright.service.store.decision_requests import What
@@ -52,10 +52,10 @@ def make_jobs(
     directory = LoopDirectory(loops, store, open_loop, registry, machine, buses)
     knowledge = KeptKnowledge(store, machine.lock())
     operation = OperationHeard(store, directory, knowledge)
-    passing_on = PassingOn(store, machine)
-    decisions = Decisions(store, directory, machine, knowledge, passing_on)
-    locking = Locking(store, directory, decisions, passing_on)
-    carrying_out = CarryingOut(
+    forwarded_decisions = ForwardedDecisions(store, machine)
+    decisions = Decisions(store, directory, machine, knowledge, forwarded_decisions)
+    locking = Locking(store, directory, decisions, forwarded_decisions)
+    requested_decisions = RequestedDecisions(
         store,
         machine,
         registry,
@@ -74,7 +74,7 @@ def make_jobs(
         worker=Worker(store, journal, directory, registry, tune, rehearse, machine, knowledge, operation, ended),
         decisions=decisions,
         locking=locking,
-        carrying_out=carrying_out,
+        requested_decisions=requested_decisions,
         aftercare=Aftercare(store, directory, machine),
         recovery=Recovery(loops, store, open_loop, resume, lambda: registry.stopping),
         machine=machine,

@@ -42,8 +42,8 @@ from loopwright.service.execution.procedures import tune as live
 from loopwright.service.execution.rehearsals import rehearsed_in_pool
 from loopwright.service.inputs.config import LoopConfig, load_site
 from loopwright.service.jobs.dbos_engine import POLL_S, DurableEngine
+from loopwright.service.jobs.history_observer import HistoryObserver
 from loopwright.service.jobs.kept_figures import KeptFigures
-from loopwright.service.jobs.looking import Looking
 from loopwright.service.jobs.loop_directory import LoopFactory
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.jobs.retention import Retention, RetentionPolicy
@@ -263,7 +263,7 @@ def serve(setup: Setup, open_loop: LoopFactory | None = None, tune: Tune | None 
         stack.callback(listening.close)
         jobs.operation.connect(listening, pool)
         looking = stack.enter_context(
-            closing(Looking(jobs.directory, jobs.registry, store, listening, jobs.knowledge, pool))
+            closing(HistoryObserver(jobs.directory, jobs.registry, store, listening, jobs.knowledge, pool))
         )
         watching = stack.enter_context(closing(Watching(store, jobs.directory, jobs.decisions, listening, pool)))
         others = OtherGateways(store)

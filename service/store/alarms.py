@@ -11,7 +11,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from loopwright.service.jsonable import JsonObject
-from loopwright.service.store import audit, claims
+from loopwright.service.store import audit, idempotency_effects
 from loopwright.service.store.clock import now
 from loopwright.service.store.false_pv import FALSE_PV, not_acknowledged
 from loopwright.service.store.store import Store
@@ -119,7 +119,7 @@ def acknowledge(store: Store, row: AlarmAcknowledgementRow) -> AlarmAcknowledgem
             if earlier is not None:
                 raise AlreadyAcknowledged(earlier)
             _add(session, row)
-            claims.changed(session, f"/alarms/{row.alarm_id}")
+            idempotency_effects.changed(session, f"/alarms/{row.alarm_id}")
     except IntegrityError:  # another gateway was faster by a moment
         faster = find(store, row.alarm_id)
         if faster is None:

@@ -11,7 +11,7 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from loopwright.service.states.job_state import ACTIVE, JobState
-from loopwright.service.store import audit, claims
+from loopwright.service.store import audit, idempotency_effects
 from loopwright.service.store.clock import now
 from loopwright.service.store.tables import BatchLoopRow, BatchRow, JobRow
 from loopwright.tuning.reasons import Reason
@@ -115,7 +115,7 @@ def add(session: Session, host: str, request: Mapping[str, object], loops: Seque
     session.add_all(BatchLoopRow(batch_id=row.id, position=n, loop=loop) for n, loop in enumerate(loops))
     after = {"request": request, "loops": list(loops)}
     audit.record(session, "batch", row.id, after=after, by=by)
-    claims.made(session, f"/batches/{row.id}")
+    idempotency_effects.made(session, f"/batches/{row.id}")
     return row
 
 
@@ -201,7 +201,7 @@ def stop(
             f"batch {batch_id} ended at {row.ended_at} as {row.state}: nothing of it is left to stop. "
             f"GET /batches/{batch_id} says what became of each loop"
         )
-    claims.changed(session, f"/batches/{batch_id}")
+    idempotency_effects.changed(session, f"/batches/{batch_id}")
     if row.stop_reason == StopReason.OPERATOR or row.stop_reason == reason:
         return False
     row.state, row.stop_reason, row.detail = BatchState.STOPPING.value, reason.value, detail

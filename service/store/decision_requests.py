@@ -22,9 +22,9 @@ from sqlalchemy.orm import Session
 from loopwright.service.jsonable import JsonObject, json_object
 from loopwright.service.security.keys import Scope
 from loopwright.service.security.principal import Principal, current
-from loopwright.service.store import claims
-from loopwright.service.store.claims import Claim
+from loopwright.service.store import idempotency_effects
 from loopwright.service.store.gateways import NOW_S
+from loopwright.service.store.idempotency_effects import Claim
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import DecisionRequestRow as Row
 
@@ -159,7 +159,7 @@ def ask(
 ) -> int:
     """Stores a request of the present caller for the gateway `host`; returns its number. One that came with the same
     Idempotency-Key and is still open is taken over. Raises SQLAlchemyError, FolderInUse."""
-    who, claim = current.get(), claims.current.get()
+    who, claim = current.get(), idempotency_effects.current.get()
     with store.writing() as session:
         session.execute(delete(Row).where(Row.asked_s < _NOW_S - _KEPT_S))
         if claim is not None:

@@ -1,7 +1,8 @@
 """Keys under which clients repeat a POST (the header Idempotency-Key), and the answers that they get again.
 
 A request claims its key before anything else is done. What it makes or changes is noted beside the key in the
-transaction that does so (service.store.claims), hence a service that is killed before the answer is kept does not do it
+transaction that does so (service.store.idempotency_effects), hence a service that is killed before the answer is kept
+does not do it
 twice: the repetition finds what there is.
 """
 
@@ -16,10 +17,10 @@ from sqlalchemy import delete, select, true, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from loopwright.service.store.claims import Claim, StillAnswering
 from loopwright.service.store.clock import stamp
 from loopwright.service.store.clock_watch import STEP
 from loopwright.service.store.hosts import Ages
+from loopwright.service.store.idempotency_effects import Claim, StillAnswering
 from loopwright.service.store.lock import HostLock
 from loopwright.service.store.store import Store
 from loopwright.service.store.tables import IdempotencyRow

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from loopwright.service.jsonable import JsonObject, json_object, to_jsonable
 from loopwright.service.states.job_state import ACTIVE, MOVES, JobState
 from loopwright.service.states.loop_state import gains_of, same_gains
-from loopwright.service.store import audit, claims, false_pv, late, loop_locks
+from loopwright.service.store import audit, false_pv, idempotency_effects, illegal_moves, loop_locks
 from loopwright.service.store.clock import now
 from loopwright.service.store.jobs import JobColumns
 from loopwright.service.store.tables import ChunkRow, EventRow, JobRow
@@ -58,7 +58,7 @@ def check(session: Session, row: JobRow, wanted: JobState) -> None:
     """Raises IllegalMove, with words for who asks for it, unless the job may become so."""
     present = row.state
     if wanted not in MOVES[present]:
-        raise late.too_late(row, present, wanted, decided(session, row))
+        raise illegal_moves.too_late(row, present, wanted, decided(session, row))
 
 
 def may_begin(session: Session, row: JobRow) -> None:
@@ -83,7 +83,7 @@ def move(session: Session, row: JobRow, wanted: JobState, by: str, columns: JobC
     details |= {key: columns[key] for key in ("reason", "detail") if columns.get(key)}
     append(session, row.id, "state", details, row.plant_time_s)
     if wanted in DECISIONS:
-        claims.changed(session, f"/jobs/{row.id}")
+        idempotency_effects.changed(session, f"/jobs/{row.id}")
         held = (row.restored or {}).get("gains") if "restored" in columns else None
         _audit_decision(session, row, previous, wanted, by, held if isinstance(held, dict) else None)
     return row
@@ -111,7 +111,7 @@ def note_stop(session: Session, job_id: str, reason: Reason, by: str, heard: boo
     row = find(session, job_id, lock=True)
     if not (heard and row.stop_reason is None and row.state in _CUT_SHORT):
         check(session, row, JobState.ABORTED)
-    claims.changed(session, f"/jobs/{job_id}")
+    idempotency_effects.changed(session, f"/jobs/{job_id}")
     if row.stop_reason is None:
         row.stop_reason = reason
         append(session, job_id, "abort_requested", {"by": by}, row.plant_time_s, at)
@@ -120,13 +120,13 @@ def note_stop(session: Session, job_id: str, reason: Reason, by: str, heard: boo
     return row
 
 
-def decided(session: Session, row: JobRow) -> late.Decided | None:
+def decided(session: Session, row: JobRow) -> illegal_moves.Decided | None:
     """Who has decided the job last; None: nobody has."""
     if row.state not in DECISIONS:
         return None
     mine = (EventRow.job_id == row.id, EventRow.kind == "state")
     event = session.scalars(select(EventRow).where(*mine).order_by(EventRow.seq.desc()).limit(1)).one_or_none()
-    return None if event is None else late.Decided(str(event.data.get("by", "")), event.at)
+    return None if event is None else illegal_moves.Decided(str(event.data.get("by", "")), event.at)
 
 
 def last_begun(session: Session, job_id: str) -> str | None:

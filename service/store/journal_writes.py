@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from loopwright.service.jsonable import json_object
 from loopwright.service.security.principal import current as principal
 from loopwright.service.states.job_state import IllegalMove
-from loopwright.service.store import claims, sample_blocks
+from loopwright.service.store import idempotency_effects, sample_blocks
 from loopwright.service.store.clock import now
 from loopwright.service.store.job_rows import add_next, append, find, note_stop
 from loopwright.service.store.tables import ChunkRow, EventRow
@@ -74,5 +74,5 @@ def as_asked(write: Write) -> Write:
     """The same write for the journal's thread: by the present principal, and with the present idempotency key."""
     request = Context()
     request.run(principal.set, principal.get())
-    request.run(claims.current.set, claims.current.get())
+    request.run(idempotency_effects.current.set, idempotency_effects.current.get())
     return lambda session: request.run(write, session)

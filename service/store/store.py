@@ -15,7 +15,15 @@ from sqlalchemy.orm import Session
 
 from loopwright.service.jsonable import json_object
 from loopwright.service.states.job_state import ACTIVE, JobState
-from loopwright.service.store import audit, batches, claims, job_rows, late, loop_locks, sample_blocks
+from loopwright.service.store import (
+    audit,
+    batches,
+    idempotency_effects,
+    illegal_moves,
+    job_rows,
+    loop_locks,
+    sample_blocks,
+)
 from loopwright.service.store.clock import now
 from loopwright.service.store.damage import Damage
 from loopwright.service.store.database import (
@@ -231,7 +239,7 @@ class Store:
                 session.add(row)
                 session.flush()
                 job_rows.append(session, row.id, "state", {"state": row.state, "by": by}, 0.0)
-                claims.made(session, f"/jobs/{row.id}")
+                idempotency_effects.made(session, f"/jobs/{row.id}")
                 audit.record(session, "retune", row.id, after=row.request, loop=loop, by=by)
                 if also is not None:
                     also(session, row)
@@ -297,7 +305,7 @@ class Store:
         with self.writing() as session:
             row = job_rows.find(session, job_id, lock=True)
             if row.state not in ACTIVE:
-                raise late.too_late(row, row.state, JobState.RUNNING, job_rows.decided(session, row))
+                raise illegal_moves.too_late(row, row.state, JobState.RUNNING, job_rows.decided(session, row))
             job_rows.may_begin(session, row)
             job_rows.set_columns(row, columns)
             job_rows.append(session, job_id, "resumed", details, row.plant_time_s)
@@ -332,7 +340,7 @@ class Store:
         wanted = select(JobRow).where(JobRow.loop == loop, JobRow.state.in_(_ACTIVE), JobRow.dry_run.is_(False))
         with self._session() as session:
             row = session.scalars(wanted).one_or_none()
-            return None if row is None else Busy(loop, row.id, late.busy(row))
+            return None if row is None else Busy(loop, row.id, illegal_moves.busy(row))
 
     def check_move(self, job_id: str, wanted: JobState) -> None:
         """Raises IllegalMove, with words for who asks for it, unless the job may become so."""

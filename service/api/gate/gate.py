@@ -20,10 +20,7 @@ from starlette.types import Scope as AsgiScope
 
 from loopwright.service.api import problems
 from loopwright.service.api.gate.bodies import Bodies, BodyRefused, begins_with
-from loopwright.service.api.gate.cookies import not_proved, token_of
-from loopwright.service.api.gate.key_checks import KeyChecks, TooOften
-from loopwright.service.api.gate.limits import Buckets, RequestLimits, retry_after
-from loopwright.service.api.gate.places import (
+from loopwright.service.api.gate.concurrency import (
     DECIDES,
     SAFE_METHODS,
     Full,
@@ -35,6 +32,9 @@ from loopwright.service.api.gate.places import (
     kind_of,
     stops_a_test,
 )
+from loopwright.service.api.gate.cookies import not_proved, token_of
+from loopwright.service.api.gate.key_checks import KeyChecks, TooOften
+from loopwright.service.api.gate.limits import Buckets, RequestLimits, retry_after
 from loopwright.service.loops.shared_reading import asked_at
 from loopwright.service.security.keys import Scope
 from loopwright.service.security.principal import LOCAL, Principal, current

@@ -15,7 +15,7 @@ class RequestLimits:
 
     rate_per_s, burst: requests of one client; decisions (abort, accept, roll back, acknowledge) are counted apart.
     at_once, streams_at_once, computations_at_once: requests of that kind, waiting or being answered, of all clients;
-    one client may have half of them (`service.api.gate.places` has the kinds without an option).
+    one client may have half of them (`service.api.gate.concurrency` has the kinds without an option).
     body_bytes: length of one body.  bodies_bytes: all bodies that have begun to arrive; one client may have half.
     body_s: time for a body to arrive.  wait_s: time that a request waits for its turn before it is refused.
     bad_keys_per_s, bad_keys_burst: unknown keys from one address, and guesses at one key.

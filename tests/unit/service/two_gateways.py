@@ -17,9 +17,9 @@ from loopwright.service.alarms.alarm import Alarm
 from loopwright.service.alarms.watch import AlarmWatch
 from loopwright.service.inputs.config import parse_site
 from loopwright.service.inputs.request import FastRetune
+from loopwright.service.jobs.forwarded_decisions import PATIENCE_S
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.jobs.passing_on import PATIENCE_S
 from loopwright.service.listening.heard_loop import Heard
 from loopwright.service.listening.listening import Listening
 from loopwright.service.live.other_gateways import LOOK_S, OtherGateways
@@ -162,7 +162,7 @@ class TwoGateways:
 
     def stop_looking(self) -> None:
         """The gateway there lives, and begins nothing that is asked of it."""
-        self.there.jobs.carrying_out.close()
+        self.there.jobs.requested_decisions.close()
 
 
 @contextmanager

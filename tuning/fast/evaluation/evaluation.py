@@ -9,7 +9,7 @@ from loopwright.tuning.fast.design.design import DesignSpec, GainDesign, Optimal
 from loopwright.tuning.fast.design.requirements import keeping, possible_instead
 from loopwright.tuning.fast.design.uncertainty import difference_of_rivals, durbin_watson_ratio, peak, uncertainty_of_Ms
 from loopwright.tuning.fast.record import Excitation, ExperimentRecord
-from loopwright.tuning.fast.score_tests.instead_of_loads import instead_of_loads
+from loopwright.tuning.fast.score_tests.rival_explanations import rival_explanations
 from loopwright.tuning.fast.score_tests.score_tests import ScoreTests
 from loopwright.tuning.fast.score_tests.two_lags import find_two_lags
 from loopwright.tuning.fast.score_tests.valve_faults import find_valve_fault
@@ -223,7 +223,7 @@ def _instead_of_loads(
     next step twice where there is a second path, and a load disturbance stays as it is. Where a gain that changes
     explains the record better, the record is not explained by a linear plant.
     """
-    instead = instead_of_loads(fit, found)
+    instead = rival_explanations(fit, found)
     # a record of one side hardly shows the other one, and its proposal says so
     as_well = MIN_BIC_GAIN if instead is not None and instead.changing and fit.record.one_sided else -RIVAL_BIC
     if instead is None or instead.bic_gain < as_well:

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from loopwright.service.api.gate.concurrency import Full, Places, stops_a_test
 from loopwright.service.api.gate.gate import Policy
-from loopwright.service.api.gate.places import Full, Places, stops_a_test
 from loopwright.service.security.keys import Scope, new_key
 from loopwright.service.security.sessions import BrowserSessions
 from loopwright.service.store import audit

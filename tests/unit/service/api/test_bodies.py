@@ -12,8 +12,8 @@ from fastapi.testclient import TestClient
 
 from loopwright.service.api.bodies import JsonRoute
 from loopwright.service.api.gate.bodies import SMALL
+from loopwright.service.api.gate.concurrency import DECIDES, kind_of
 from loopwright.service.api.gate.gate import Policy
-from loopwright.service.api.gate.places import DECIDES, kind_of
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.security.keys import Scope
 from loopwright.service.server.assembly import make_jobs

@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 
 from loopwright.service.api.gate import key_checks
+from loopwright.service.api.gate.concurrency import Full, Places, RequestKind, Room, kind_of
 from loopwright.service.api.gate.connections import Connections, OnceAMinute, WarningOnceAMinute
 from loopwright.service.api.gate.gate import Policy
 from loopwright.service.api.gate.limits import RequestLimits
-from loopwright.service.api.gate.places import Full, Places, RequestKind, Room, kind_of
 from loopwright.service.loops.loop import Loop
 from loopwright.service.security.keys import Scope, matches, new_key
 from loopwright.service.server.serving import listen

@@ -18,11 +18,11 @@ from loopwright.service.api.gate.limits import RequestLimits
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.security.keys import Scope
-from loopwright.service.store import audit, claims
-from loopwright.service.store.claims import Claim, StillAnswering
+from loopwright.service.store import audit, idempotency_effects
 from loopwright.service.store.clock_watch import STEP, ClockWatch, Seen
 from loopwright.service.store.hosts import Ages, keep_seen
 from loopwright.service.store.idempotency import MAX_BYTES, Answer, IdempotencyKeys, OtherRequest
+from loopwright.service.store.idempotency_effects import Claim, StillAnswering
 from loopwright.service.store.keyring import Keyring
 from loopwright.service.store.store import Store
 from loopwright.tuning.reasons import Failed, Reason
@@ -501,9 +501,9 @@ def test_another_gateway_takes_over_from_one_that_is_gone(two: tuple[Store, Stor
     here, there = (IdempotencyKeys(store) for store in two)
     claim(here, "nothing done")
     half = claim(here, "job made")
-    token = claims.current.set(half)
+    token = idempotency_effects.current.set(half)
     job = two[0].create("L", {}, "me", False).id
-    claims.current.reset(token)
+    idempotency_effects.current.reset(token)
     assert claim(there, "job made").effect == f"/jobs/{job}"  # also while it lives: what it was to do is done
     two[0].close()  # the server lets go of what the gateway held a moment later
     found: list[Claim] = []
@@ -526,12 +526,12 @@ def test_who_was_taken_over_from_makes_no_second_job(two: tuple[Store, Store], m
     monkeypatch.setattr("loopwright.service.store.lock.HostLock.free", lambda *_: True)
     second = claim(there, "a")
     for store, held, jobs in ((two[0], first, 0), (two[1], second, 1)):
-        token = claims.current.set(held)
+        token = idempotency_effects.current.set(held)
         try:
             store.create("L", {}, "me", False)
         except StillAnswering:
             assert held is first
-        claims.current.reset(token)
+        idempotency_effects.current.reset(token)
         assert len(two[0].recent()) == jobs
     here.keep(first, Answer(500, {}, b""))
     there.keep(second, YES)

@@ -69,7 +69,7 @@ def test_a_line_for_each_second_with_the_job_that_has_the_loop(capsys: pytest.Ca
     loop_live.follow(client, "TIC-101", "degC", Console(), as_json=False)
     one, two, three, lost = capsys.readouterr().out.splitlines()
     assert one.endswith("  SP 65.00 degC, PV 64.98 degC, MV 40.10 %, automatic")
-    assert two.endswith("experiment, job 4f0c2a9be113: relay 42%, about 31 s of plant time left")
+    assert two.endswith("experiment, job 4f0c2a9be113: Relay test 42%, about 31 s of plant time left")
     assert three.endswith("  no data: no data for 4 s")
     assert lost == "the service at http://gateway has ended the stream, it is tried again"
 

@@ -14,14 +14,14 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from loopwright.service.errors import Conflict, GatewayLost, Locked, NotKnown, Stopping
-from loopwright.service.jobs.carrying_out import CarryingOut
+from loopwright.service.jobs.forwarded_decisions import answer_to, raise_of
 from loopwright.service.jobs.machine import Machine
-from loopwright.service.jobs.passing_on import answer_to, raise_of
 from loopwright.service.jobs.registry import Registry
+from loopwright.service.jobs.requested_decisions import RequestedDecisions
 from loopwright.service.security.keys import Scope
 from loopwright.service.security.principal import Principal, current
 from loopwright.service.states.job_state import IllegalMove, JobState
-from loopwright.service.store import audit, claims, decision_requests
+from loopwright.service.store import audit, decision_requests, idempotency_effects
 from loopwright.service.store.decision_requests import AnswerKind, DecisionRequest, RequestAnswer, RequestState, What
 from loopwright.service.store.idempotency import IdempotencyKeys
 from loopwright.service.store.store import Busy
@@ -138,7 +138,7 @@ def test_a_lock_that_comes_before_the_gateway_has_begun_holds(fleet: TwoGateways
     fleet.stop_looking()
     asked = fleet.asked(job)
     fleet.there.jobs.locking.lock(TAG_THERE, "valve", "me")
-    fleet.there.jobs.carrying_out.look()
+    fleet.there.jobs.requested_decisions.look()
     assert assert_problem(asked.result(60), 409)["reason"] == "locked"
     assert writes == [] and fleet.there.controller.state.gains == OLD
 
@@ -184,7 +184,7 @@ def test_a_gateway_that_falls_silent_meanwhile(fleet: TwoGateways, writes: list[
     problem = assert_problem(asked.result(60), 503)
     assert problem["reason"] == "gateway_lost" and "withdrawn" in problem["detail"]
     assert fleet.here.requests() == [("accept", "withdrawn")]
-    fleet.there.jobs.carrying_out.look()
+    fleet.there.jobs.requested_decisions.look()
     assert writes == [] and fleet.here.requests() == [("accept", "withdrawn")]
     assert fleet.here.http.get(f"/jobs/{job}").json()["decision_request"]["state"] == "withdrawn"
 
@@ -199,7 +199,7 @@ def test_one_that_takes_longer_is_202_and_the_job_says_what_becomes_of_it(
     answer = asked.result(60)
     assert (answer.status_code, answer.headers["location"]) == (202, f"/jobs/{job}")
     assert answer.json()["state"] == "proposed" and answer.json()["decision_request"]["state"] == "waiting"
-    fleet.there.jobs.carrying_out.look()
+    fleet.there.jobs.requested_decisions.look()
     until(lambda: fleet.here.http.get(f"/jobs/{job}").json()["state"] == "accepted")
     assert writes == [NEW] and fleet.here.http.get(f"/jobs/{job}").json()["decision_request"] is None
 
@@ -225,7 +225,7 @@ def test_one_whose_gateway_comes_back_an_hour_later_is_not_carried_out(fleet: Tw
     decision_requests.ask(fleet.here.store, THERE, What.ACCEPT, TAG_THERE, job, "A. Lind")
     fleet.here.sql("UPDATE decision_requests SET asked_s = asked_s - 3600, expires_s = expires_s - 3600")
     assert fleet.here.http.get(f"/jobs/{job}").json()["decision_request"]["state"] == "expired"
-    fleet.there.jobs.carrying_out.look()
+    fleet.there.jobs.requested_decisions.look()
     assert fleet.here.requests() == [("accept", "expired")] and writes == []
     assert fleet.there.controller.state.gains == OLD
 
@@ -250,10 +250,10 @@ def test_one_that_its_gateway_had_begun_as_it_was_killed_is_not_begun_again(
     fleet.stop_looking()
     decision_requests.ask(fleet.here.store, THERE, What.ACCEPT, TAG_THERE, job, "A. Lind")
     assert len(decision_requests.take(fleet.there.store, 4)) == 1  # and the process is gone
-    CarryingOut(fleet.there.store, Machine(), Registry(), {}).look()
+    RequestedDecisions(fleet.there.store, Machine(), Registry(), {}).look()
     assert fleet.here.requests() == [("accept", "cut_off")] and writes == []
     assert fleet.here.http.get(f"/jobs/{job}").json()["decision_request"]["state"] == "cut_off"
-    CarryingOut(fleet.there.store, Machine(), fleet.there.jobs.registry, {}).look()
+    RequestedDecisions(fleet.there.store, Machine(), fleet.there.jobs.registry, {}).look()
     assert writes == []
 
 
@@ -262,7 +262,7 @@ def test_a_gateway_that_ends_begins_nothing(fleet: TwoGateways, writes: list[Gai
     fleet.stop_looking()
     decision_requests.ask(fleet.here.store, THERE, What.ACCEPT, TAG_THERE, job, "A. Lind")
     fleet.there.jobs.request_stop()
-    fleet.there.jobs.carrying_out.look()
+    fleet.there.jobs.requested_decisions.look()
     assert fleet.here.requests() == [("accept", "waiting")] and writes == []
 
 
@@ -297,21 +297,21 @@ def test_a_repetition_after_the_asking_gateway_was_killed_joins_the_request(
     fleet.stop_looking()
     keys = IdempotencyKeys(fleet.here.store)
     claim = keys.claim("key", "one", "fingerprint")
-    assert isinstance(claim, claims.Claim)
-    token = claims.current.set(claim)
+    assert isinstance(claim, idempotency_effects.Claim)
+    token = idempotency_effects.current.set(claim)
     try:
         first = decision_requests.ask(fleet.here.store, THERE, What.ACCEPT, TAG_THERE, job, "A. Lind")
         assert decision_requests.ask(fleet.here.store, THERE, What.ACCEPT, TAG_THERE, job, "A. Lind") == first
         assert decision_requests.ask(fleet.here.store, THERE, What.ROLLBACK, TAG_THERE, job, "A. Lind") != first
     finally:
-        claims.current.reset(token)
+        idempotency_effects.current.reset(token)
     fleet.here.sql("DELETE FROM decision_requests WHERE number <> :first", first=first)
-    fleet.there.jobs.carrying_out.look()
+    fleet.there.jobs.requested_decisions.look()
     until(lambda: fleet.here.requests() == [("accept", "done")])
     again = IdempotencyKeys(fleet.there.store)  # of a gateway that has not been cut off
     fleet.here.sql("UPDATE idempotency_keys SET host = 'gone'")
     found = again.claim("key", "one", "fingerprint")
-    assert isinstance(found, claims.Claim) and found.effect == f"/jobs/{job}" and writes == [NEW]
+    assert isinstance(found, idempotency_effects.Claim) and found.effect == f"/jobs/{job}" and writes == [NEW]
 
 
 def test_a_lock_made_here_waits_for_a_decision_that_writes_there(fleet: TwoGateways) -> None:

@@ -13,8 +13,8 @@ from loopwright.service.api.job_views import job_view
 from loopwright.service.execution.procedures import rehearse
 from loopwright.service.inputs.request import FastRetune, retune_request
 from loopwright.service.jobs import manager as jobs_module
+from loopwright.service.jobs.database_retries import STOP_PATIENCE_S
 from loopwright.service.jobs.progress import Progress
-from loopwright.service.jobs.until_answered import STOP_PATIENCE_S
 from loopwright.service.loops.bus_restore import RESTORE_PATIENCE_S
 from loopwright.service.loops.loop import Restored
 from loopwright.service.results import ModelView, TransferModelView

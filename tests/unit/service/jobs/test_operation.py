@@ -19,7 +19,7 @@ from loopwright.tuning.fast.design.design import DesignSpec
 from loopwright.tuning.fast.known_plant.plant import NothingKnown, ObservedPlant
 from loopwright.tuning.reasons import Failed, Reason
 from tests.unit.service.fakes import TAG, Service
-from tests.unit.service.jobs.test_looking import MOVES, PoolInThisProcess
+from tests.unit.service.jobs.test_history_observer import MOVES, PoolInThisProcess
 from tests.unit.service.observing.operated import HeardBefore, Operated
 
 LOOP = Operated()

@@ -6,7 +6,7 @@ import { html } from "../html.js";
 import { duration, entered, fixed, known, ms, pvDecimals, significant, unit, withUnit } from "../numbers.js";
 import { jobPath } from "../router.js";
 import { isSilent, rowOf, sign, signature } from "../state.js";
-import { sentence } from "../words.js";
+import { sentence, stageName } from "../words.js";
 
 /** Obstacles that a test looks at again for itself before it gives up: it may be started. */
 const PASSING = ["not_at_rest"];
@@ -184,7 +184,7 @@ function What(p, loop) {
     <p key="goes">${known(p.mv_low_pct) && html`MV moves between <b>${fixed(p.mv_low_pct, 0)} and ${fixed(p.mv_high_pct, 0)} %</b> (present ${fixed(p.mv, 0)} %). `}${known(p.pv_low)
       ? html`PV is expected between <b>${fixed(p.pv_low, decimals)} and ${pv(p.pv_high)}</b>, by ${p.pv_known_by}.`
       : moving.some(hasPv)
-        ? html`How far PV goes is known of some stages alone, by ${p.pv_known_by}: ${moving.filter(hasPv).map((/** @type {any} */ each, /** @type {number} */ n) => html`${n ? ", " : ""}${each.stage} <b>${fixed(each.pv_low, decimals)} to ${pv(each.pv_high)}</b>`)}.`
+        ? html`How far PV goes is known of some stages alone, by ${p.pv_known_by}: ${moving.filter(hasPv).map((/** @type {any} */ each, /** @type {number} */ n) => html`${n ? ", " : ""}${stageName(each.stage)} <b>${fixed(each.pv_low, decimals)} to ${pv(each.pv_high)}</b>`)}.`
         : p.computing ? "How far PV goes is being computed…" : "How far PV goes is not known beforehand: no model of this loop tells it."}</p>
     <p key="ends">It ends by itself if PV leaves <b>${fixed(p.watched.pv.low, Math.min(3, decimals))} … ${pv(p.watched.pv.high)}</b>, if anybody else moves the loop, or when you abort. Then, as at its end, the loop has its mode, ${manual ? "manual output" : "set-point"} and gains back. New gains are a proposal until you accept them.</p>
     <p key="time" class="quiet">It takes ${duration(p.duration_low_s)} to ${duration(p.duration_high_s)} of plant time, estimated from ${p.duration_basis}.</p>`;

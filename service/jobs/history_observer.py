@@ -63,7 +63,7 @@ class _Loop:
     sample_time_s: float | None = None
 
 
-class Looking:
+class HistoryObserver:
     """Looks at the loops of this host, in a thread.
 
     wall: the wall clock, s since 1970 UTC, and so the clock of the history.

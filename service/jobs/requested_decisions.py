@@ -8,12 +8,12 @@ from collections.abc import Callable, Mapping
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from loopwright.service.jobs.database_retries import DatabaseRetries
+from loopwright.service.jobs.forwarded_decisions import CUT_OFF, answer_to
 from loopwright.service.jobs.machine import Machine
-from loopwright.service.jobs.passing_on import CUT_OFF, answer_to
 from loopwright.service.jobs.registry import Registry
-from loopwright.service.jobs.until_answered import UntilAnswered
 from loopwright.service.security.principal import current
-from loopwright.service.store import claims, decision_requests
+from loopwright.service.store import decision_requests, idempotency_effects
 from loopwright.service.store.database import urgent
 from loopwright.service.store.decision_requests import DecisionRequest, RequestAnswer, RequestState, What
 from loopwright.service.store.lock import FolderInUse
@@ -33,7 +33,7 @@ Carry = Callable[[DecisionRequest], object]
 """Carries a request out. Raises as the decision does."""
 
 
-class CarryingOut:
+class RequestedDecisions:
     """Carries out what other gateways ask of this one.
 
     how: what to do, by what is asked.
@@ -43,7 +43,7 @@ class CarryingOut:
     def __init__(self, store: Store, machine: Machine, registry: Registry, how: Mapping[What, Carry]) -> None:
         self._store, self._registry, self._how = store, registry, how
         self._machine = machine
-        self._lasting = UntilAnswered(machine, registry)
+        self._lasting = DatabaseRetries(machine, registry)
         self._at_work: dict[int, threading.Thread] = {}
         self._over = machine.event()
         self._thread = machine.thread(self._run, "requests of other gateways")
@@ -82,7 +82,7 @@ class CarryingOut:
 
     def _carry(self, request: DecisionRequest) -> None:
         current.set(request.principal)
-        claims.current.set(request.claim)
+        idempotency_effects.current.set(request.claim)
         urgent.set(True)
         with about(job=request.job_id or "", loop=request.loop):
             try:

@@ -18,7 +18,7 @@ STOP_PATIENCE_S = 20.0
 _AGAIN_S = 0.5
 
 
-class UntilAnswered:
+class DatabaseRetries:
     """Repeats a call of the database until it answers; while the service stops, only for STOP_PATIENCE_S."""
 
     def __init__(self, machine: Machine, registry: Registry) -> None:

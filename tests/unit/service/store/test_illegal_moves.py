@@ -8,8 +8,8 @@ import pytest
 
 from loopwright.service.inputs.request import FastRetune
 from loopwright.service.states.job_state import MOVES, IllegalMove, JobState
-from loopwright.service.store import late
-from loopwright.service.store.late import Decided
+from loopwright.service.store import illegal_moves
+from loopwright.service.store.illegal_moves import Decided
 from loopwright.service.store.tables import JobRow
 from loopwright.tuning.reasons import Reason
 from tests.unit.service.api.test_api import assert_problem
@@ -27,7 +27,7 @@ def job(state: JobState, **changes: object) -> JobRow:
 
 def words(now: JobState, wanted: JobState, **changes: object) -> str:
     decided = Decided("B. Berg", AT) if now in (JobState.ACCEPTED, JobState.ROLLED_BACK) else None
-    return str(late.too_late(job(now, **changes), now, wanted, decided))
+    return str(illegal_moves.too_late(job(now, **changes), now, wanted, decided))
 
 
 @pytest.mark.parametrize(("state", "changes", "said"), [
@@ -39,7 +39,7 @@ def words(now: JobState, wanted: JobState, **changes: object) -> str:
      "loop TIC-101 is busy with job 4f0c of A. Lind, which is being stopped: ask again in a moment"),
 ])  # fmt: skip
 def test_a_loop_that_a_job_has(state: JobState, changes: dict[str, object], said: str) -> None:
-    assert late.busy(job(state, **changes)) == said
+    assert illegal_moves.busy(job(state, **changes)) == said
 
 
 @pytest.mark.parametrize(("now", "wanted", "said"), [

@@ -25,7 +25,7 @@ PATIENCE_S = 5.0
 _LOOK_S = 0.1
 
 
-class PassingOn:
+class ForwardedDecisions:
     """Passes decisions on to the gateway that has the loop."""
 
     def __init__(self, store: Store, machine: Machine) -> None:

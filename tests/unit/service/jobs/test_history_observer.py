@@ -12,7 +12,7 @@ import pytest
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NotWanted
 from loopwright.service.inputs.request import FastRetune
-from loopwright.service.jobs.looking import CHECK_S, LOOK_EVERY_S, Looking
+from loopwright.service.jobs.history_observer import CHECK_S, LOOK_EVERY_S, HistoryObserver
 from loopwright.service.listening.rings import Rings
 from loopwright.service.store import knowledge
 from loopwright.tuning.reasons import Reason
@@ -58,7 +58,7 @@ class Looked:
         self.listening = OneLoop(Rings())
         self.goes_on(0.0)
         jobs = service.jobs
-        self.looking = Looking(
+        self.looking = HistoryObserver(
             jobs.directory, jobs.registry, service.store, self.listening, jobs.knowledge, self.pool,
             wall=lambda: self.now_s,
         )  # type: ignore[arg-type]  # fmt: skip

@@ -27,7 +27,7 @@ class Instead:
     plausible: bool
 
 
-def instead_of_loads(fit: Fit[ExperimentRecord], best: Fitted) -> Instead | None:
+def rival_explanations(fit: Fit[ExperimentRecord], best: Fitted) -> Instead | None:
     """What explains the record best in place of the load disturbances of the best model; None where the model has none,
     or where what is found is too small to matter for Ms."""
     found = [each for each in (_second_path(fit, best), _changing_gain(fit, best)) if each is not None]
