@@ -33,7 +33,7 @@ _BUS_ADVICE = (
     "Check the interface and the cable. The bus is opened again every 2 s; controllers whose tests ran on it bring "
     "their loops by themselves."
 )
-_EAR_ADVICE = "It is started again by itself. Tests go on; what the loops do is not seen until then."
+_LISTENING_ADVICE = "It is started again by itself. Tests go on; what the loops do is not seen until then."
 _GATEWAY_ADVICE = f"{ADVICE[Reason.GATEWAY_LOST]} What alarms there are there is not known here meanwhile."
 _SEE_THE_JOB = "See the job."
 _WHEN_PV_IS_RIGHT = (
@@ -228,11 +228,11 @@ def _watches(known: AlarmFacts) -> Iterator[Condition]:
             kind, since_s, text = AlarmKind.FALSE_PV, _seconds(trouble.at), f"PV is false. {trouble.text}"
             advice = (
                 "Look at the sensor and the loop now: it is in automatic on this PV unless you put it in manual. "
-                f"Nothing was written to it, and the watch puts no gains back. {_UNTIL_ACKNOWLEDGED}"
+                f"Nothing was written to it, and monitoring puts no gains back. {_UNTIL_ACKNOWLEDGED}"
             )
         elif trouble.rolled_back:
             kind, since_s = AlarmKind.ROLLED_BACK, _seconds(trouble.at)
-            text = f"The previous gains were put back by the watch: {trouble.text}"
+            text = f"The previous gains were put back automatically: {trouble.text}"
             advice = (
                 f"Look at the loop, and at what was found of the model, before it is retuned. {_UNTIL_ACKNOWLEDGED}"
             )
@@ -252,7 +252,7 @@ def _mismatch(watch: AcceptanceWatch) -> str:
 
 
 def _why_not(trouble: Trouble) -> str:
-    return "" if trouble.reason is None else f"They were not put back by the watch: {trouble.reason}."
+    return "" if trouble.reason is None else f"They were not put back automatically: {trouble.reason}."
 
 
 def _gateways(known: AlarmFacts) -> Iterator[Condition]:
@@ -273,7 +273,7 @@ def _buses(known: AlarmFacts) -> Iterator[Condition]:
         why = bus.why.replace(f"bus '{bus.url}' ", "it ", 1)
         text, advice = f"Bus {bus.url} is down: {why}", _BUS_ADVICE
         if bus.why.startswith("the listening process"):
-            text, advice = f"No data of bus {bus.url}: {bus.why}", _EAR_ADVICE
+            text, advice = f"No data of bus {bus.url}: {bus.why}", _LISTENING_ADVICE
         yield Condition(
             alarm_id(AlarmKind.BUS_DOWN, known.host, bus.url), AlarmKind.BUS_DOWN, bus.url, text, advice, known.host,
             loops=_tags(loop.config for loop in known.loops if loop.config.bus == bus.url),

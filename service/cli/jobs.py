@@ -131,7 +131,7 @@ def one_job(
     auto_rollback: Annotated[
         bool,
         typer.Option(
-            help="With --accept: have the previous gains put back while the loop is watched, if PV leaves its limits "
+            help="With --accept: have the previous gains put back while the loop is monitored, if PV leaves its limits "
             "or an oscillation grows."
         ),
     ] = True,

@@ -25,7 +25,7 @@ from loopwright.service.jobs.journal import Journal, temporary
 from loopwright.service.jobs.locking import Locking
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.machine import Machine
-from loopwright.service.jobs.operation import OperationHeard
+from loopwright.service.jobs.operation import OperationKnowledge
 from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.requested_decisions import RequestedDecisions
@@ -77,7 +77,7 @@ class Jobs:
         recovery: Recovery,
         machine: Machine,
         knowledge: KeptKnowledge,
-        operation: OperationHeard,
+        operation: OperationKnowledge,
     ) -> None:
         self.store = store
         self.engine = engine

@@ -30,14 +30,14 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Ears:
+class ObservationMeans:
     """What hears the loops, and what computes."""
 
     listening: Listening
     pool: Pool
 
 
-class OperationHeard:
+class OperationKnowledge:
     """What normal operation has shown of the loops of this host.
 
     wall: the wall clock, s since 1970 UTC, and so the clock of the history.
@@ -51,11 +51,11 @@ class OperationHeard:
         wall: Callable[[], float] = time.time,
     ) -> None:
         self._store, self._directory, self._knowledge, self._wall = store, directory, knowledge, wall
-        self._ears: Ears | None = None
+        self._means: ObservationMeans | None = None
 
     def connect(self, listening: Listening, pool: Pool) -> None:
         """Gives it the listening and the processes that compute; until then nothing is known."""
-        self._ears = Ears(listening, pool)
+        self._means = ObservationMeans(listening, pool)
 
     def known(
         self, job: Job, config: LoopConfig, spec: DesignSpec, unwanted: Callable[[], bool]
@@ -75,9 +75,9 @@ class OperationHeard:
     def _heard(
         self, config: LoopConfig, spec: DesignSpec, unwanted: Callable[[], bool]
     ) -> ObservedPlant | NothingKnown:
-        if self._ears is None:
+        if self._means is None:
             return NothingKnown("the service does not listen to its loops")
-        listening, pool = self._ears.listening, self._ears.pool
+        listening, pool = self._means.listening, self._means.pool
         try:
             state = self._directory.read(config.tag)
             disturbers = self._directory.disturbers(config.tag)

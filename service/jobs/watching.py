@@ -58,7 +58,7 @@ from loopwright.tuning.reasons import Ended
 
 log = logging.getLogger(__name__)
 
-BY = "watch after acceptance"
+BY = "monitoring after acceptance"
 """Who puts gains back, as the audit log has it."""
 OUTSIDE_S = 3.0
 """Wall time for which PV must be outside its limits, s."""

@@ -33,7 +33,7 @@ from loopwright.service.jobs.journal import Journal
 from loopwright.service.jobs.loop_directory import LoopDirectory
 from loopwright.service.jobs.loop_model import loop_model
 from loopwright.service.jobs.machine import Machine
-from loopwright.service.jobs.operation import OperationHeard, outdated_by
+from loopwright.service.jobs.operation import OperationKnowledge, outdated_by
 from loopwright.service.jobs.recovery import FALSE_PV_WORDS
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.loops.loop import Loop
@@ -87,7 +87,7 @@ class Worker:
         rehearse: Rehearse,
         machine: Machine,
         knowledge: KeptKnowledge,
-        operation: OperationHeard,
+        operation: OperationKnowledge,
         ended: Callable[[Job], None] = lambda job: None,
     ) -> None:
         self.store = store

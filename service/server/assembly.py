@@ -15,7 +15,7 @@ from loopwright.service.jobs.locking import Locking
 from loopwright.service.jobs.loop_directory import LoopDirectory, LoopFactory
 from loopwright.service.jobs.machine import Machine
 from loopwright.service.jobs.manager import Jobs
-from loopwright.service.jobs.operation import OperationHeard
+from loopwright.service.jobs.operation import OperationKnowledge
 from loopwright.service.jobs.recovery import Recovery
 from loopwright.service.jobs.registry import Registry
 from loopwright.service.jobs.requested_decisions import RequestedDecisions
@@ -51,7 +51,7 @@ def make_jobs(
     journal = Journal(store, beside=machine.writes_beside)
     directory = LoopDirectory(loops, store, open_loop, registry, machine, buses)
     knowledge = KeptKnowledge(store, machine.lock())
-    operation = OperationHeard(store, directory, knowledge)
+    operation = OperationKnowledge(store, directory, knowledge)
     forwarded_decisions = ForwardedDecisions(store, machine)
     decisions = Decisions(store, directory, machine, knowledge, forwarded_decisions)
     locking = Locking(store, directory, decisions, forwarded_decisions)

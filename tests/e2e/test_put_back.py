@@ -52,7 +52,7 @@ def test_gains_under_which_an_oscillation_grows_are_taken_back(here: Plantsite) 
     assert (state.gains.Kp, state.gains.Ti) == pytest.approx((LOOP.kp, LOOP.ti)) and state.gains != accepted
     assert here.is_home()
     latest = here.http.get("/audit").json()[0]
-    assert (latest["what"], latest["by"], latest["subject"]) == ("rollback", "watch after acceptance", job_of(url))
+    assert (latest["what"], latest["by"], latest["subject"]) == ("rollback", "monitoring after acceptance", job_of(url))
 
 
 def job_of(url: str) -> str:

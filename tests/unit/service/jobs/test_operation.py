@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from loopwright.service.inputs.request import retune_request
-from loopwright.service.jobs.operation import OperationHeard, outdated_by
+from loopwright.service.jobs.operation import OperationKnowledge, outdated_by
 from loopwright.service.listening.rings import Rings
 from loopwright.service.store import job_knowledge, knowledge
 from loopwright.service.store.jobs import Job, JobEvent
@@ -37,7 +37,7 @@ class Heard:
         self.service, self.now_s, self.pool = service, time.time() + 10.0, PoolInThisProcess()
         service.controller.state = replace(service.controller.state, gains=LOOP.gains, sample_time_s=LOOP.Ts)
         jobs = service.jobs
-        self.operation = OperationHeard(service.store, jobs.directory, jobs.knowledge, lambda: self.now_s)
+        self.operation = OperationKnowledge(service.store, jobs.directory, jobs.knowledge, lambda: self.now_s)
         self.rings = LOOP.heard(moves, 3800, self.now_s)
         self.operation.connect(HeardBefore(self.rings), self.pool)  # type: ignore[arg-type]
         self.job = self.new_job()

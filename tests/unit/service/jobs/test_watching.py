@@ -100,7 +100,7 @@ def test_a_loop_that_becomes_unstable_gets_its_old_gains_back(service: Service, 
     assert trouble.kind is TroubleKind.GROWING_OSCILLATION and "PV oscillates under the new gains" in trouble.text
     assert service.controller.state.gains == OLD and here.watch.end is WatchEnd.ROLLED_BACK
     last = audit.trail(service.store.engine, 1)[0]
-    assert (last.what, last.by, last.key) == ("rollback", "watch after acceptance", "service")
+    assert (last.what, last.by, last.key) == ("rollback", "monitoring after acceptance", "service")
     (alarm,) = alarms(client, "rolled_back")
     assert alarm["unacknowledged"] and "put back by the watch" in alarm["text"]
     client.post(f"/alarms/{alarm['id']}/acknowledge", json={"by": "operator B"})
