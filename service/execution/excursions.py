@@ -125,7 +125,7 @@ def _asked(config: LoopConfig, request: RetuneRequest, state: LoopState, known: 
 def _within_limits(asked: _Asked, unit: str) -> ExpectedPv:
     facts, stages = asked.facts, _stages(asked)
     relay, begins_with = stages.get("relay"), None
-    adapted = isinstance(asked.request, FastRetune) and asked.request.amplitude_pct is None
+    adapted = asked.request.adapts_relay
     if relay is not None and adapted and _share(relay, facts) > 1.0:
         amplitude = FIRST_AMPLITUDE * max_amplitude(0.0, facts.mv_low, facts.mv_high, facts.mv_step_max)
         least = MIN_OUTPUT_RANGE * asked.noise / (relay.down + relay.up)
@@ -164,7 +164,7 @@ def _sentence(asked: _Asked, stage: str, stages: Mapping[str, Reach], unit: str)
     down, up = (max(getattr(each, side) for each in stages.values()) for side in ("down", "up"))
     limits = f"PV limits of {min(low, rest - down):.5g} .. {max(high, rest + up):.5g}"
     share = max(reach.likely_up / facts.pv_high, reach.likely_down / -facts.pv_low) if facts.pv_low < 0.0 else math.inf
-    given = asked.request.amplitude_pct if isinstance(asked.request, FastRetune) else None
+    given = asked.request.relay_amplitude_pct
     if stage != "relay":
         step = config.sp_deviation * SIZED_TO / share
         return f"{text}; ask for an sp_deviation of at most {step:.3g} {unit}, or for {limits}"
@@ -240,8 +240,8 @@ def _plans(asked: _Asked, model: Model) -> Iterator[tuple[Plan[Any], Mode]]:
     if isinstance(request, FiveStages):
         yield five_stage(facts, request.options), Mode.AUTOMATIC
         return
-    if isinstance(request, FastRetune) and request.start == "design" and request.model is not None:
-        yield trial(facts, request.options, request.model.plant()), Mode.AUTOMATIC
+    if request.known_model is not None:
+        yield trial(facts, request.options, request.known_model), Mode.AUTOMATIC
         return
     spec = request.options.spec()
     options = request.options if isinstance(request, FastRetune) else FastOptions()

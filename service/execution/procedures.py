@@ -30,7 +30,6 @@ from loopwright.tuning.experiments.primitives import Facts
 from loopwright.tuning.experiments.settle import after_settling
 from loopwright.tuning.fast.excitation_choice import NOT_ASKED
 from loopwright.tuning.fast.known_plant.plant import NothingKnown, ObservedPlant
-from loopwright.tuning.models import Model
 from loopwright.tuning.plan import Event, Mode, Note, Plan, Sample
 from loopwright.tuning.reasons import Ended, Failed, NoGain, Reason, Refused
 
@@ -216,9 +215,8 @@ def _procedure(
         from loopwright.tuning.fast.excitation_choice import fast_by
         from loopwright.tuning.fast.known_plant.design_trial import trial
 
-        known = _known_model(request)
-        if known is not None:
-            return trial(facts, request.options, known)
+        if request.known_model is not None:
+            return trial(facts, request.options, request.known_model)
         options = replace(request.options, begins_with=begins_with)
         return fast_by(excitations(config, request, mode), facts, options, plant)
     if isinstance(request, SetpointRetune):
@@ -239,17 +237,11 @@ def rehearse(config: LoopConfig, request: RetuneRequest, hooks: Hooks) -> Outcom
 
     spec, on = rehearsal_spec(config, request, hooks.ground)
     hooks.on_event(Note(f"rehearsed on {on.plant_text}; {on.gains_text}; nothing is tested on the loop"))
-    known = _known_model(request) if isinstance(request, FastRetune) else None
     # A model entered for a dry run is the plant itself; the procedure still starts where the request says.
     found = rehearse_spec(
-        spec, request.method, hooks.on_event, hooks.on_samples, model=known, asked=request.options,
+        spec, request.method, hooks.on_event, hooks.on_samples, model=request.known_model, asked=request.options,
         excitations=excitations(config, request, hooks.ground.mode),
     )  # fmt: skip
     if found.ended is None or isinstance(found.ended, NoGain):
         return Outcome(found.result.model_copy(update={"rehearsed_on": on}), None, None, found.plant_time_s)
     return Outcome(empty_result(request.method, on), found.ended, None, found.plant_time_s)
-
-
-def _known_model(request: FastRetune) -> Model | None:
-    """Returns the model for which fast designs without a relay, None where it needs one."""
-    return request.model.plant() if request.start == "design" and request.model else None

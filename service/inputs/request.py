@@ -37,14 +37,15 @@ from loopwright.service.inputs.plausible import (
 from loopwright.service.inputs.validation import STRICT, Whole, branch, branch_of, did_you_mean
 from loopwright.tuning.experiments.primitives import Directions
 from loopwright.tuning.experiments.step_limits import not_kept
-from loopwright.tuning.fast.design.design import MAX_WEIGHT, Aim
+from loopwright.tuning.fast.design.design import MAX_WEIGHT, Aim, DesignSpec
 from loopwright.tuning.fast.design.options import DesignOptions
+from loopwright.tuning.fast.excitation_choice import chosen_stages
 from loopwright.tuning.fast.known_plant.design_trial import trial_stages
-from loopwright.tuning.fast.pulses.procedure import SETPOINT
+from loopwright.tuning.fast.pulses.procedure import SETPOINT, setpoint_stages
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.relay.procedure import FAST, SWITCHES, FastOptions
 from loopwright.tuning.five_stage.procedure import PROCEDURE, Options, rule_of, stages_of
-from loopwright.tuning.models import FOPDT, SOPDT
+from loopwright.tuning.models import FOPDT, SOPDT, Model
 from loopwright.tuning.plan import Mode
 from loopwright.tuning.reasons import Refused
 from loopwright.tuning.rules.registry import METHODS
@@ -163,6 +164,62 @@ class _Retune(Bounds):
         """The given options as a JSON object."""
         return self.model_dump(mode="json", exclude_none=True)
 
+    # What the planning of a retune asks of each method.
+
+    def stages(self, excitations: tuple[Excitation, ...]) -> tuple[str, ...]:
+        """The stages that the retune may have, in their order. excitations: what may move the loop, see below."""
+        raise NotImplementedError
+
+    @property
+    def chooses_excitation(self) -> bool:
+        """Whether the loop may be moved in several ways."""
+        return False
+
+    @property
+    def pulses_setpoint(self) -> bool:
+        """Whether the set-point is moved by pulses, whatever else the loop permits."""
+        return False
+
+    @property
+    def known_model(self) -> Model | None:
+        """The model on which gains are designed without an experiment."""
+        return None
+
+    @property
+    def fits_record(self) -> bool:
+        """Whether a model is fitted to the whole record of an experiment."""
+        return False
+
+    @property
+    def relay_amplitude_pct(self) -> float | None:
+        """The step of MV up under the relay that was asked for, percent."""
+        return None
+
+    @property
+    def adapts_relay(self) -> bool:
+        """Whether the relay is as large as PV's answer to it permits."""
+        return False
+
+    @property
+    def largest_weight(self) -> float | None:
+        """The largest set-point weight that was asked for."""
+        return None
+
+    @property
+    def design(self) -> DesignSpec | None:
+        """What the gains are designed for; None where a rule gives them."""
+        return None
+
+    @property
+    def entered_Pu_s(self) -> float | None:
+        """The ultimate period that was entered, s."""
+        return None
+
+    @property
+    def overshoot_asked_pct(self) -> tuple[float, float]:
+        """The smallest and the largest overshoot of a set-point step that is looked for, percent."""
+        return 0.0, 0.0
+
     @classmethod
     def _foreign(cls, data: Mapping[str, object]) -> list[str]:
         """The names in `data` that only another method knows."""
@@ -258,6 +315,14 @@ class DesignRetune(_Retune):
     def options(self) -> DesignOptions:
         raise NotImplementedError
 
+    @property
+    def largest_weight(self) -> float | None:
+        return self.setpoint_weight_max
+
+    @property
+    def design(self) -> DesignSpec:
+        return self.options.spec()
+
     @classmethod
     def _of_another(cls) -> list[str]:
         return [name for name in FiveStages.model_fields if name not in FastRetune.model_fields]
@@ -308,6 +373,29 @@ class FastRetune(DesignRetune):
     def options(self) -> FastOptions:
         return self._options
 
+    def stages(self, excitations: tuple[Excitation, ...]) -> tuple[str, ...]:
+        return chosen_stages(excitations, self.verify) if self.chooses_excitation else trial_stages(self.verify)
+
+    @property
+    def chooses_excitation(self) -> bool:
+        return self.start == "relay"
+
+    @property
+    def known_model(self) -> Model | None:
+        return self.model.plant() if self.start == "design" and self.model is not None else None
+
+    @property
+    def fits_record(self) -> bool:
+        return self.chooses_excitation
+
+    @property
+    def relay_amplitude_pct(self) -> float | None:
+        return self.amplitude_pct
+
+    @property
+    def adapts_relay(self) -> bool:
+        return self.amplitude_pct is None
+
     @classmethod
     def _foreign(cls, data: Mapping[str, object]) -> list[str]:
         return [
@@ -344,6 +432,17 @@ class SetpointRetune(DesignRetune):
     @property
     def options(self) -> DesignOptions:
         return self._options
+
+    def stages(self, excitations: tuple[Excitation, ...]) -> tuple[str, ...]:
+        return setpoint_stages(self.verify)
+
+    @property
+    def pulses_setpoint(self) -> bool:
+        return True
+
+    @property
+    def fits_record(self) -> bool:
+        return True
 
     @model_validator(mode="after")
     def _understood(self) -> Self:
@@ -414,6 +513,17 @@ class FiveStages(_Retune):
     @property
     def options(self) -> Options:
         return self._options
+
+    def stages(self, excitations: tuple[Excitation, ...]) -> tuple[str, ...]:
+        return stages_of(self.start, self._options.baseline, self.verify)
+
+    @property
+    def entered_Pu_s(self) -> float | None:
+        return self.Pu_s
+
+    @property
+    def overshoot_asked_pct(self) -> tuple[float, float]:
+        return self.overshoot_window_pct
 
     @classmethod
     def _of_another(cls) -> list[str]:
@@ -525,7 +635,7 @@ def excitations(loop: LoopConfig, request: RetuneRequest, mode: Mode = Mode.AUTO
     loop: the loop with the limits of the request.
     mode: the mode of the loop.
     """
-    if not isinstance(request, FastRetune) or request.start == "design":
+    if not request.chooses_excitation:
         return ()
     permitted = loop.test.excitations
     if "manual" in permitted and (mode is Mode.MANUAL or permitted == ("manual",)):
@@ -551,7 +661,7 @@ def wrong_mode(loop: LoopConfig, request: RetuneRequest, mode: Mode) -> str | No
         return f"{text}, and excitations permit nothing but pulses of the manual output"
     if mode is not Mode.MANUAL:
         return text
-    if isinstance(request, FastRetune) and request.start == "relay":
+    if request.chooses_excitation and isinstance(request, FastRetune):
         asked = "" if request.excitations is None else ", and name manual among the excitations asked for"
         return f"{text}; to tune it in manual, permit manual in loops.yaml (test: excitations){asked}"
     return (
@@ -566,7 +676,7 @@ def check_setpoint_source(loop: LoopConfig, request: RetuneRequest, mode: Mode |
     mode: the mode of the loop; None where it is not known yet: a loop that may be in manual is then left for later.
     """
     tried = excitations(loop, request, Mode.MANUAL if mode is None else mode)
-    pulses = isinstance(request, SetpointRetune) or (tried and not {Excitation.RELAY, Excitation.MANUAL} & {*tried})
+    pulses = request.pulses_setpoint or (tried and not {Excitation.RELAY, Excitation.MANUAL} & {*tried})
     if loop.setpoint_from == "operator" or not pulses or request.dry_run:
         return
     tag, outer = loop.tag, loop.outer_loop or "another controller"
@@ -593,7 +703,7 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
             problems.append(f"{name}_low {low:g} must be less than {name}_high {high:g} {unit}")
         limits[f"{name}_limits"] = allowed.model_copy(update={"low": low, "high": high})
     mv = limits["mv_limits"]
-    amplitude = request.amplitude_pct if isinstance(request, FastRetune) else None
+    amplitude = request.relay_amplitude_pct
     if amplitude is not None and 1.5 * amplitude > mv.high - mv.low and not problems:
         problems.append(
             f"a relay of amplitude_pct {amplitude:g} needs {1.5 * amplitude:g} % of MV between its limits, "
@@ -605,7 +715,7 @@ def narrow(loop: LoopConfig, request: RetuneRequest) -> tuple[LoopConfig, list[s
     problems += refused
     highest = loop.setpoint_weight_max
     try:
-        highest = permitted_weight(loop, request.setpoint_weight_max if isinstance(request, DesignRetune) else None)
+        highest = permitted_weight(loop, request.largest_weight)
     except BadLimits as error:
         problems.append(str(error))
     deviation = request.sp_deviation or loop.sp_deviation
@@ -688,14 +798,10 @@ def _narrow_moves(loop: LoopConfig, request: RetuneRequest) -> tuple[PermittedTe
 
 def _not_kept(test: PermittedTest, request: RetuneRequest) -> list[str]:
     """What a retune by steps of the set-point cannot keep, in sentences; empty for one by pulses."""
-    if isinstance(request, SetpointRetune):
+    if request.pulses_setpoint:
         return []
-    if isinstance(request, FastRetune):
-        stages, mirrored = trial_stages(request.verify), True
-    else:
-        stages = stages_of(request.start, request.options.baseline, request.verify)
-        mirrored = False
-    return not_kept(Directions(test.directions), test.sp_rate_max_per_s or math.inf, stages, mirrored)
+    mirrored = request.known_model is not None
+    return not_kept(Directions(test.directions), test.sp_rate_max_per_s or math.inf, request.stages(()), mirrored)
 
 
 def _given_dead_time_s(request: RetuneRequest) -> float:

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from loopwright.service.errors import NotKnown, Stopping
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import DesignRetune, RetuneRequest, check_setpoint_source, within
+from loopwright.service.inputs.request import RetuneRequest, check_setpoint_source, within
 from loopwright.service.jobs.active_job import Running
 from loopwright.service.jobs.aftercare import Aftercare
 from loopwright.service.jobs.database_retries import STOP_PATIENCE_S, DatabaseRetries
@@ -187,7 +187,7 @@ class Jobs:
         if self.stopping:
             raise Stopping(self.why_stopping)
         asked = request.asked()
-        if isinstance(request, DesignRetune) and narrowed.setpoint_weight_max is not None:
+        if request.design is not None and narrowed.setpoint_weight_max is not None:
             asked["setpoint_weight_max"] = narrowed.setpoint_weight_max  # it stays with the job
         made: list[Job] = []
 

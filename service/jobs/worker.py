@@ -20,7 +20,6 @@ from loopwright.service.execution.procedures import Hooks, Outcome, Rehearse, Tu
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import (
     BadLimits,
-    FastRetune,
     RetuneRequest,
     check_setpoint_source,
     excitations,
@@ -203,13 +202,13 @@ class Worker:
         self, running: Running, row: Job, config: LoopConfig, request: RetuneRequest
     ) -> ObservedPlant | NothingKnown:
         """Returns what operation has shown of the plant, where the test may begin with it."""
-        if not isinstance(request, FastRetune) or Excitation.OBSERVE not in excitations(config, request):
+        spec = request.design
+        if spec is None or Excitation.OBSERVE not in excitations(config, request):
             return NOT_ASKED
         earlier = self._lasting(lambda: self.store.events(row.id)) if row.found is not None else ()
         why = outdated_by(earlier)
         if why is not None:
             return NothingKnown(f"an earlier attempt has tried gains from operation: {why}")
-        spec = request.options.spec()
         return self._lasting(lambda: self._operation.known(row, config, spec, lambda: running.stop_reason is not None))
 
     def _note_home(self, job_id: str, read: LoopState, home: LoopState) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequest
+from loopwright.service.inputs.request import RetuneRequest
 from loopwright.tuning.experiments.preflight import MAX_ATTEMPTS, MIN_LISTENED_SAMPLES
 from loopwright.tuning.fast.evaluation.look import MIN_OWN_PERIODS
 from loopwright.tuning.fast.experiment import STEP_BACK_FRACTION, VERIFICATION_PERIODS
@@ -44,8 +44,8 @@ def durations(
     pu_s: the ultimate period, s; None where no model is known.
     ramp_s: the time that the set-point takes for the permitted step, s.
     """
-    designed_only = isinstance(request, FastRetune) and request.start == "design"
-    whole_record = not designed_only and not isinstance(request, FiveStages)
+    designed_only = request.known_model is not None
+    whole_record = request.fits_record
     minimum = MIN_SAMPLES if whole_record else MIN_LISTENED_SAMPLES
     look = max(0.5 * t95_s, minimum * (sample_time_s or 0.0))
     # a loop that is not at rest is given half a T95 before each further look

@@ -12,19 +12,15 @@ from dataclasses import dataclass, replace
 
 from loopwright.protocol.real32 import TOLERANCE
 from loopwright.service.inputs.config import LoopConfig
-from loopwright.service.inputs.request import FastRetune, FiveStages, RetuneRequest, SetpointRetune, excitations
+from loopwright.service.inputs.request import RetuneRequest, excitations
 from loopwright.service.states.loop_state import LoopState
 from loopwright.tuning.experiments.step_test import KICK_OF_ROOM
-from loopwright.tuning.fast.excitation_choice import chosen_stages
-from loopwright.tuning.fast.known_plant.design_trial import trial_stages
 from loopwright.tuning.fast.manual.manual_test import LONGEST_PULSE_T95
 from loopwright.tuning.fast.manual.procedure import MANUAL
 from loopwright.tuning.fast.manual.sizes import first_pulse, largest_pulse
-from loopwright.tuning.fast.pulses.procedure import setpoint_stages
 from loopwright.tuning.fast.pulses.pulse_test import pulse_size
 from loopwright.tuning.fast.record import Excitation
 from loopwright.tuning.fast.relay.relay_test import BIAS, FIRST_AMPLITUDE, MAX_OUTPUT_RANGE, MAX_RAISE, max_amplitude
-from loopwright.tuning.five_stage.procedure import stages_of
 from loopwright.tuning.five_stage.ultimate_gain import RUN_MV_LIMIT
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.plan import Mode
@@ -57,13 +53,7 @@ def stages_asked(config: LoopConfig, request: RetuneRequest, mode: Mode = Mode.A
     config: the configuration with the limits of the job.
     mode: the mode of the loop.
     """
-    if isinstance(request, FastRetune):
-        if request.start == "design":
-            return trial_stages(request.verify)
-        return chosen_stages(excitations(config, request, mode), request.verify)
-    if isinstance(request, SetpointRetune):
-        return setpoint_stages(request.verify)
-    return stages_of(request.start, request.options.baseline, request.verify)
+    return request.stages(excitations(config, request, mode))
 
 
 def broken_from(config: LoopConfig, request: RetuneRequest, state: LoopState) -> list[str]:
@@ -92,8 +82,8 @@ def broken_limits(config: LoopConfig, request: RetuneRequest, sp: float) -> list
         return [f"the set-point {sp:.6g} {unit} is not within the PV limits {low:g} .. {high:g}"]
     stages, broken = stages_asked(config, request), []
     share = 1.0
-    if isinstance(request, FiveStages) and "zn_pi" in stages:
-        share += request.overshoot_window_pct[0] / 100.0
+    if "zn_pi" in stages:
+        share += request.overshoot_asked_pct[0] / 100.0
     up, down = (config.test.directions in ("both", way) for way in ("up", "down"))
     stepping = any(stage in stages for stage in (*_STEPPING, "pulses"))
     if up and stepping and sp + share * step > high + hair:
@@ -102,13 +92,12 @@ def broken_limits(config: LoopConfig, request: RetuneRequest, sp: float) -> list
             f"the set-point is stepped from {sp:.6g} by up to {step:g} {unit} (sp_deviation),{overshoot} which takes "
             f"PV to {sp + share * step:.6g}, above the PV limit {high:g}: {_remedy((high - sp) / share, unit)}"
         )
-    adapted = isinstance(request, FastRetune) and request.amplitude_pct is None
     if down and ("pulses" in stages or (stepping and not up)) and sp - step < low - hair:
         broken.append(
             f"the set-point is moved from {sp:.6g} down by up to {step:g} {unit} (sp_deviation), which takes PV to "
             f"{sp - step:.6g}, below the PV limit {low:g}: {_remedy(sp - low, unit)}"
         )
-    if adapted and "relay" in stages and sp - step < low - hair:
+    if request.adapts_relay and "relay" in stages and sp - step < low - hair:
         broken.append(
             f"the relay may move PV from {sp:.6g} by up to {step:g} {unit} (sp_deviation), which takes it to "
             f"{sp - step:.6g}, below the PV limit {low:g}: {_remedy(sp - low, unit)}"
@@ -163,16 +152,16 @@ def moves(config: LoopConfig, request: RetuneRequest, before: Before) -> list[Mo
 
 
 def _moving(stage: str, config: LoopConfig, request: RetuneRequest, before: Before) -> Moves:
-    if isinstance(request, SetpointRetune):
+    if request.pulses_setpoint:
         return _setpoint(stage, config, before)
-    if not isinstance(request, FastRetune):
-        return _five_stage(stage, config, request, before)
-    if request.start == "design":
+    if request.known_model is not None:
         return _trial(stage, config, before)
-    return _by_excitation(stage, config, request, before)
+    if request.chooses_excitation:
+        return _by_excitation(stage, config, request, before)
+    return _five_stage(stage, config, request, before)
 
 
-def _by_excitation(stage: str, config: LoopConfig, request: FastRetune, before: Before) -> Moves:
+def _by_excitation(stage: str, config: LoopConfig, request: RetuneRequest, before: Before) -> Moves:
     """The moves of a stage of fast. Where relay or pulses may have made the record, the larger moves of the two."""
     tried = excitations(config, request)
     if stage == "trial":
@@ -192,12 +181,12 @@ def _by_excitation(stage: str, config: LoopConfig, request: FastRetune, before: 
     )  # fmt: skip
 
 
-def _fast(stage: str, config: LoopConfig, request: FastRetune, before: Before) -> Moves:
+def _fast(stage: str, config: LoopConfig, request: RetuneRequest, before: Before) -> Moves:
     low, high, step, unit = config.mv_limits.low, config.mv_limits.high, config.sp_deviation, config.pv_unit
     jump = config.test.mv_step_max or math.inf
     mv = low + BIAS / (1.0 + BIAS) * (high - low) if before.mv is None else before.mv
     maximum = max(0.0, max_amplitude(mv, low, high, jump))
-    given = request.amplitude_pct
+    given = request.relay_amplitude_pct
     first = given or before.begins_with or FIRST_AMPLITUDE * maximum
     up = min(MAX_RAISE * given, maximum) if given else maximum
     if stage != "relay":
@@ -304,7 +293,7 @@ def _ramp(config: LoopConfig, step: float) -> str:
     return f" It is moved at {rate:g} {config.pv_unit}/s at most: {step / rate:.3g} s for {step:.4g} {config.pv_unit}."
 
 
-def _five_stage(stage: str, config: LoopConfig, request: FiveStages, before: Before) -> Moves:
+def _five_stage(stage: str, config: LoopConfig, request: RetuneRequest, before: Before) -> Moves:
     room, step, unit, gains = _room(config, before.mv), config.sp_deviation, config.pv_unit, before.gains
     kick = KICK_OF_ROOM * room
     if stage == "relay":
@@ -320,7 +309,7 @@ def _five_stage(stage: str, config: LoopConfig, request: FiveStages, before: Bef
         run = RUN_MV_LIMIT * room
         return Moves(stage, what, run, run, step)
     if stage == "zn_pi":
-        low, high = request.overshoot_window_pct
+        low, high = request.overshoot_asked_pct
         what = (
             f"Set-point steps of up to {step:g} {unit} under a Ziegler-Nichols PI, until PV overshoots by {low:g} to "
             f"{high:g} %."

@@ -9,9 +9,7 @@ from enum import StrEnum
 from loopwright.service.errors import RemoteSetpoint
 from loopwright.service.inputs.config import LoopConfig
 from loopwright.service.inputs.request import (
-    FastRetune,
     RetuneRequest,
-    SetpointRetune,
     check_setpoint_source,
     excitations,
     narrow,
@@ -105,7 +103,7 @@ def obstacles(config: LoopConfig, request: RetuneRequest, now: Now) -> list[Obst
 
 def _ramp_obstacles(config: LoopConfig, request: RetuneRequest, facts: Facts, mode: Mode) -> list[Obstacle]:
     """Returns the obstacle where ramps of the set-point are too slow for pulses, and nothing may follow them."""
-    pulses = isinstance(request, SetpointRetune) or excitations(config, request, mode) == (Excitation.SETPOINT,)
+    pulses = request.pulses_setpoint or excitations(config, request, mode) == (Excitation.SETPOINT,)
     if not pulses:
         return []
     try:
@@ -145,7 +143,7 @@ def _mv_obstacles(
         text = f"MV {mv:.4g} leaves {room:.3g} of room within {low:.4g} .. {high:.4g}; at least {minimum:.3g} is needed"
         return [Obstacle(Reason.SATURATED, text)]
     maximum = max_amplitude(mv, low, high, config.test.mv_step_max or math.inf)
-    asked = request.amplitude_pct if isinstance(request, FastRetune) else None
+    asked = request.relay_amplitude_pct
     fits_nowhere = asked is not None and (1.0 + BIAS) * asked > high - low  # `narrow` has reported this already
     by_relay = "relay" in stages_asked(config, request, state.mode)
     if asked is not None and asked > maximum and not fits_nowhere and by_relay:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pydantic import BaseModel, Field
 
 from loopwright.service.inputs.config import Limits, LoopConfig
-from loopwright.service.inputs.request import FiveStages, RetuneRequest, narrow
+from loopwright.service.inputs.request import RetuneRequest, narrow
 from loopwright.service.planning.durations import Span, durations
 from loopwright.service.planning.excitation_preview import ExcitationPreview, excitation_previews
 from loopwright.service.planning.expected import NOTHING_EXPECTED, ExpectedPv, Reach
@@ -179,7 +179,7 @@ def preview(
     state = None if request.dry_run else now.state
     permitted = _permitted(narrowed, state)
     limited = narrowed.model_copy(update={"mv_limits": permitted})
-    pu_s = _entered_Pu_s(request) or (last.Pu_s if last else None)
+    pu_s = request.entered_Pu_s or (last.Pu_s if last else None)
     sample_time_s = state.sample_time_s if state else None
     rate = narrowed.test.sp_rate_max_per_s
     ramp_s = narrowed.sp_deviation / rate if rate else 0.0
@@ -290,15 +290,10 @@ def _budget_s(request: RetuneRequest, config: LoopConfig, state: LoopState | Non
     return time_budget_s(request.method, config.t95_s, state.sample_time_s)
 
 
-def _entered_Pu_s(request: RetuneRequest) -> float | None:
-    """Returns the ultimate period of the request; None where it was not entered."""
-    return request.Pu_s if isinstance(request, FiveStages) else None
-
-
 def _basis(request: RetuneRequest, config: LoopConfig, last: LastProposal | None) -> str:
     if request.dry_run:
         return "a dry run takes no time of the plant"
-    if (Pu_s := _entered_Pu_s(request)) is not None:
+    if (Pu_s := request.entered_Pu_s) is not None:
         return f"Pu {Pu_s:g} s as entered, and T95 {config.t95_s:g} s of the configuration"
     if last is not None and last.Pu_s:
         return f"Pu {last.Pu_s:.4g} s of the model that job {last.job_id} found, and T95 {config.t95_s:g} s"

@@ -12,6 +12,7 @@ from loopwright.tuning.experiments.step_limits import not_kept
 from loopwright.tuning.experiments.step_test import StepResult
 from loopwright.tuning.experiments.verification import verification
 from loopwright.tuning.fast.design.design import DesignSpec, GainDesign, OptimalGains
+from loopwright.tuning.fast.design.options import DesignOptions
 from loopwright.tuning.fast.design.requirements import required
 from loopwright.tuning.fast.evaluation.proposal import (
     FastProposal,
@@ -21,7 +22,7 @@ from loopwright.tuning.fast.evaluation.proposal import (
     delayed,
     ultimate,
 )
-from loopwright.tuning.fast.relay.procedure import FAST, FastOptions
+from loopwright.tuning.fast.relay.procedure import FAST
 from loopwright.tuning.models import Model, TransferFunction, sign, time_constants
 from loopwright.tuning.plan import Plan, StageDone, StageStarted, worked
 from loopwright.tuning.reasons import Reason, Refused
@@ -44,7 +45,7 @@ def designed_on(model: Model, spec: DesignSpec, sample_time_s: float) -> Optimal
     return required(GainDesign(delayed(model, 0.5 * sample_time_s), spec, period))
 
 
-def _considered(model: Model, options: FastOptions, facts: Facts) -> tuple[OptimalGains, Comparison]:
+def _considered(model: Model, options: DesignOptions, facts: Facts) -> tuple[OptimalGains, Comparison]:
     """The best gains on the model and their comparison with the present gains. Raises Refused, NOT_ROBUST or
     NOT_POSSIBLE."""
     best = designed_on(model, options.spec(), facts.sample_time_s)
@@ -52,7 +53,7 @@ def _considered(model: Model, options: FastOptions, facts: Facts) -> tuple[Optim
     return best, comparison_on(sampled, best, facts, options.spec(), options.propose_anyway)
 
 
-def trial(facts: Facts, options: FastOptions, model: Model) -> Plan[FastProposal]:
+def trial(facts: Facts, options: DesignOptions, model: Model) -> Plan[FastProposal]:
     """The plan of a trial, for a loop in automatic and at rest.
 
     model: the process model that the gains are designed on.
