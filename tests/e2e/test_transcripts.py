@@ -23,7 +23,7 @@ FOLDER = Path(__file__).parents[2] / "docs" / "transcripts"
 @dataclass(frozen=True)
 class Day:
     """A transcript. ports: those that it names. within: by which part the numbers of two runs differ. pictures: files
-    that its commands write and it shows. data: files that its reader has."""
+    that its commands write. data: files that its reader has."""
 
     name: str
     ports: tuple[int, ...] = ()
@@ -65,9 +65,6 @@ def test_a_day_goes_as_it_is_written(day: Day, tmp_path: Path) -> None:
     if write and not all_alike:  # the answers of one document are those of one run
         page.write_text(after + text[at:], encoding="utf-8")
     assert all((tmp_path / name).stat().st_size > 1000 for name in day.pictures)
-    if write and not all_alike:
-        for name in day.pictures:
-            shutil.copy(tmp_path / name, FOLDER / f"{page.stem}-{name}")
 
 
 def test_the_teachers_file_is_one_that_is_read_elsewhere_too() -> None:
