@@ -56,7 +56,7 @@ def under_test(page: Page) -> Locator:
 
 
 def dock(page: Page) -> Locator:
-    return page.get_by_role("region", name="Tests under way")
+    return page.get_by_role("region", name="Jobs under way")
 
 
 def abort_button(page: Page, tag: str = TAG) -> Locator:

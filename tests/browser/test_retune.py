@@ -123,7 +123,7 @@ def test_another_Ms_is_tried_on_the_loop_before_it_can_be_accepted(site: Site, p
     expect(page.get_by_role("button", name="Accept the new gains")).to_be_enabled()
     # the first proposal is no longer to be decided
     page.goto(f"/ui{first['url']}")
-    expect(person.headline(page)).to_have_text("Proposed, not decided; a later test came")
+    expect(person.headline(page)).to_have_text("Proposed, not decided; a later job came")
     expect(page.get_by_role("button", name="Accept the new gains")).not_to_be_attached()
 
 

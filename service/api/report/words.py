@@ -90,7 +90,7 @@ def headline(job: JobView) -> str:
     """Returns how the job ended."""
     text = _ENDS.get(job.state, job.state.value.replace("_", " "))
     if job.state is JobState.PROPOSED and job.superseded_by:
-        return f"{text}, not decided; a later test came"
+        return f"{text}, not decided; a later job came"
     if job.reason is not None and job.state in _WITH_REASON:
         return f"{text}: {reason_words(job.reason)}"
     return text

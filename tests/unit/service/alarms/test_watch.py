@@ -360,7 +360,7 @@ def test_over_rest(service: Service, client: TestClient) -> None:
     detail = assert_problem(client.post(f"/alarms/{alarm['id']}/acknowledge", json={}), 409)["detail"]
     assert "acknowledged by A. Lind at " in detail
     for path in ("/alarms/none", "/alarms/none/acknowledge"):
-        method = "POST" if path.endswith("off") else "GET"
+        method = "POST" if path.endswith("acknowledge") else "GET"
         assert "there is no alarm none" in assert_problem(client.request(method, path), 404)["detail"]
     assert client.get("/audit?what=acknowledge_alarm").json()[0]["by"] == "A. Lind"
 

@@ -275,7 +275,7 @@ def test_lines_of_a_job_carry_job_and_loop(
     (failure,) = [x for x in lines if "exception" in x]
     assert "ValueError: a defect" in failure["exception"] and failure["level"] == "error"
     (asked, _) = [x for x in lines if x["logger"] == "loopwright.service.api.gate.access_log" and x["method"] == "POST"]
-    assert (asked["loop"], asked["status"], asked["who"]) == (TAG, 202, "local")
+    assert (asked["loop"], asked["status"], asked["key"]) == (TAG, 202, "local")
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", asked["at"])
 
 

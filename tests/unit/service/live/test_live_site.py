@@ -60,8 +60,8 @@ def test_samples_come_once_and_what_stops_is_no_longer_shown(site: Site) -> None
         assert row["no_data"].startswith("no data for ")
         viewer.becomes("alarms", lambda message: [each["kind"] for each in message.get("alarms", [])] == ["node_lost"])
         (alarm,) = site.http.get("/alarms").json()
-        assert (alarm["level"], alarm["subject"], alarm["loops"]) == (2, f"node 10h on {site.bus}", [TAG])
-        assert site.metric('loopwright_alarms{level="2"}') == 1.0
+        assert (alarm["priority"], alarm["subject"], alarm["loops"]) == (2, f"node 10h on {site.bus}", [TAG])
+        assert site.metric('loopwright_alarms{priority="2"}') == 1.0
 
         site.hub.stop()
         down = viewer.until("buses", lambda message: message["buses"][0]["up"] is False)

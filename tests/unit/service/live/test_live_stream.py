@@ -126,7 +126,7 @@ def test_alarms_come_first_and_on_every_change_as_a_whole(screens: Screens) -> N
         service.tune.ends = Failed(Reason.NODE_LOST, "silent")
         service.wait(service.jobs.start(TAG, FastRetune()).id)
         (alarm,) = viewer.until("alarms")["alarms"]
-        assert (alarm["level"], alarm["loop"], alarm["text"]) == (3, TAG, "The last test failed: node lost")
+        assert (alarm["priority"], alarm["loop"], alarm["text"]) == (3, TAG, "The last test failed: node lost")
         with viewing(screens.base) as later:
             later.becomes("alarms", lambda message: message.get("alarms") == [alarm])
             screens.alarms.acknowledge(alarm["id"], "A. Lind")
@@ -141,7 +141,7 @@ def test_many_viewers_ask_the_database_as_often_as_one(screens: Screens) -> None
 
     @database_event.listens_for(screens.service.store.engine, "before_cursor_execute")
     def _(*arguments: object) -> None:
-        if "jobs.dry_run, jobs.by" in str(arguments[2]):  # no other query has these side by side
+        if 'jobs.dry_run, jobs."by"' in str(arguments[2]):  # no other query has these side by side
             asked.append(time.monotonic())
 
     with viewing(screens.base) as first:

@@ -114,7 +114,7 @@ export function headline(job) {
   switch (job.state) {
     case "queued": return "Queued";
     case "running": return job.stopping ? "Aborting, the loop is being restored" : "Under test";
-    case "proposed": return job.superseded_by ? "Proposed, not decided; a later test came" : "New gains are proposed";
+    case "proposed": return job.superseded_by ? "Proposed, not decided; a later job came" : "New gains are proposed";
     case "accepted": return "Accepted";
     case "rolled_back": return "Rolled back to the previous gains";
     case "no_gain": return "No improvement: the loop is tuned as well as asked";
@@ -130,7 +130,7 @@ export function headline(job) {
 /** A state in a table. @param {any} job */
 export function stateWords(job) {
   switch (job.state) {
-    case "proposed": return job.superseded_by ? "not decided, a later test came" : "awaiting decision";
+    case "proposed": return job.superseded_by ? "not decided; a later job came" : "awaiting decision";
     case "rolled_back": return "rolled back";
     case "no_gain": return "no improvement";
     case "refused": return `refused: ${reasonWords(job.reason)}`;

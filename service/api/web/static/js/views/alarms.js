@@ -40,7 +40,7 @@ export function AlarmsView() {
       const loop = each.loop ? loops.value?.get(each.loop) : null;
       const old = isSilent.value && each.id !== "silent";
       const row = html`<tr key=${each.id} class=${old ? "old" : ""}><td>${AlarmSymbol(each.priority)}</td><td>${Subject(each)}</td>
-        <td class="what"><b>${each.text}</b> ${each.job && html`<a key="job" href=${jobPath(each.job)}>the test</a>`}<small key="advice">${each.advice}</small></td>
+        <td class="what"><b>${each.text}</b> ${each.job && html`<a key="job" href=${jobPath(each.job)}>the job</a>`}<small key="advice">${each.advice}</small></td>
         <td class="since" title=${when(each.since)}>${old ? when(each.since) : duration(Math.max(0, now_s.value - Date.parse(each.since) / 1000))}</td>
         <td class="c-description">${loop?.description}</td><td class="c-area">${loop?.area}</td><td class="do">${AcknowledgeButton(each)}</td></tr>`;
       return asking.value === each.id ? [row, html`<tr key=${`sign ${each.id}`} class="question"><td colspan="7"><${AcknowledgeQuestion} alarm=${each} /></td></tr>`] : [row];

@@ -76,7 +76,7 @@ function Form() {
   const [problem, setProblem] = useState(/** @type {any} */ (null));
   const [sending, setSending] = useState(false);
   /** @type {Record<string, any>} */
-  const body = { method: "fast", ms: Number(asked), pattern: pattern.trim() || null };
+  const body = { method: "fast", Ms: Number(asked), pattern: pattern.trim() || null };
   let bad = "";
   for (const [name, text] of [["at_once_per_bus", perBus], ["at_once_per_area", perArea], ["stop_after_failures", failures]]) {
     const value = entered(text);

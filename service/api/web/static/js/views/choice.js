@@ -216,8 +216,8 @@ function Decide({ loop, detail, job, latest, ms, tested, atTested, back, onChang
   else if (job.state === "proposed" && latest) inside = html`<span class="say">The loop runs on its previous gains until you accept.</span><button key="keep" disabled=${dead} data-opens="keep" onClick=${() => open("keep")}>Keep the previous gains…</button><button key="accept" class="main" disabled=${dead} data-opens="accept" onClick=${() => open("accept")}>Accept the new gains…</button>`;
   else if (job.state === "accepted" && latest) inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>${detail?.live ? html`; in effect now: Kp ${significant(detail.live.gains.Kp)}, Ti ${significant(detail.live.gains.Ti)} s${weight(detail.live.gains)}` : ""}.</span><button key="rollback" disabled=${dead} data-opens="rollback" onClick=${() => open("rollback")}>Roll back to the previous gains…</button>`;
   else if (job.state === "rolled_back") inside = html`<span class="say">The loop runs on its previous gains${job.decided ? `; decided by ${job.decided.by}` : ""}.</span>`;
-  else if (job.state === "proposed") inside = html`<span class="say">Not decided; a later test came.</span>`;
-  else if (job.state === "accepted") inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>; a later test came.</span>`;
+  else if (job.state === "proposed") inside = html`<span class="say">Not decided; a later job came.</span>`;
+  else if (job.state === "accepted") inside = html`<span class="say">Accepted by <b>${job.decided?.by ?? "–"}</b>; a later job came.</span>`;
   if (!inside && !problem) return null;
   return html`<div class="decide" ref=${group} role="group" aria-label="Decision">${inside}${request && !pending && !asking && html`<p class="quiet" key="request">${decisionRequestWords(request, loop.gateway)}</p>`}${problem && html`<p class="refusal" role="alert" key="problem">${problem.message} <span class="advice">${problem.advice ?? ""}</span></p>`}</div>`;
 }

@@ -77,7 +77,7 @@ export function Dock() {
   const own = all.find((each) => each.loop === dockLoop.value);
   const shown = own ? [own] : all.slice(0, MOST);
   const more = all.length - shown.length;
-  return html`<section class=${`dock ${shown.length > 1 ? "many" : ""}`} aria-label="Tests under way">
+  return html`<section class=${`dock ${shown.length > 1 ? "many" : ""}`} aria-label="Jobs under way">
     ${shown.map((job) => html`<${Cell} key=${job.id} job=${job} more=${own ? more : 0} />`)}
     ${!own && more > 0 && html`<a key="more" href="/ui/">${more} more under test</a>`}
   </section>`;
@@ -104,5 +104,5 @@ function Cell({ job, more }) {
 /** @param {number | null} fraction @param {boolean} [stopping] */
 export function Progress(fraction, stopping = false) {
   const done = Math.min(1, Math.max(0, fraction ?? 0));
-  return html`<span class=${`progress ${stopping ? "stopping" : ""}`} role="progressbar" aria-label="Progress of the test" aria-valuemin="0" aria-valuemax="100" aria-valuenow=${Math.round(done * 100)}><span style=${{ transform: `scaleX(${done.toFixed(4)})` }}></span></span>`;
+  return html`<span class=${`progress ${stopping ? "stopping" : ""}`} role="progressbar" aria-label="Progress of the job" aria-valuemin="0" aria-valuemax="100" aria-valuenow=${Math.round(done * 100)}><span style=${{ transform: `scaleX(${done.toFixed(4)})` }}></span></span>`;
 }

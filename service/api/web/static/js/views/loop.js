@@ -183,7 +183,7 @@ function Settings(loop, detail) {
 
 /** @param {any[]} tests */
 function Tests(tests) {
-  return html`<section class="card tests" key="tests"><h2 class="title">Earlier tests</h2>
+  return html`<section class="card tests" key="tests"><h2 class="title">Earlier jobs</h2>
     ${tests.length ? html`<ul class="tests">${tests.slice(0, 6).map((each) => html`<li key=${each.id}><a href=${jobPath(each.url)}>${when(each.ended_at ?? each.created_at)}</a>
       <small>${each.dry_run ? "rehearsal · " : ""}${stateWords(each)}${known(each.request.Ms) ? ` · Ms ${ms(each.request.Ms)}` : ""}</small></li>`)}</ul>` : html`<p class="quiet">none yet</p>`}</section>`;
 }

@@ -139,7 +139,7 @@ function Tuning(loop, job) {
   if (!last) return html`<span class="tuning quiet">not tuned yet</span>`;
   if (loop.gains_differ) return html`<span class="tuning">gains differ from the accepted</span>`;
   if (last.state === "proposed") return html`<span class="tuning"><b>awaiting decision</b> ${at}</span>`;
-  if (last.state === "accepted") return html`<span class="tuning">${known(loop.accepted?.ms) ? `Ms ${ms(loop.accepted.ms)}` : "accepted"} ${at}</span>`;
+  if (last.state === "accepted") return html`<span class="tuning">${known(loop.accepted?.Ms) ? `Ms ${ms(loop.accepted.Ms)}` : "accepted"} ${at}</span>`;
   if (last.state === "rolled_back") return html`<span class="tuning">previous gains in effect ${at}</span>`;
   if (last.state === "no_gain") return html`<span class="tuning">no improvement ${at}</span>`;
   const word = last.state === "aborted" ? "stopped" : last.state;

@@ -22,7 +22,7 @@ export function Result({ loop, detail, job, quiet = false, own = false, onChange
         ${job.decided && html`${job.decided.what === "accept" ? "accepted" : job.monitoring ? "previous gains put back" : "previous gains kept"} by ${job.decided.by}, ${when(job.decided.at)} · `}
         <a href=${`${job.url}/report`} target="_blank">Report</a><a href=${`${job.url}/samples?format=csv`} target="_blank">Samples</a>${!own && html`<a href=${jobPath(job.url)}>job ${job.id}</a>`}</p></div>
     ${job.reason && html`<div class="card" key="why"><p>${sentence(job.detail)}</p><p class="advice">${job.advice}</p>${After(loop, job)}</div>`}
-    ${job.superseded_by && html`<p class="refusal" key="later">A later test came: <a href=${jobPath(job.superseded_by)}>its result</a>.</p>`}
+    ${job.superseded_by && html`<p class="refusal" key="later">A later job came: <a href=${jobPath(job.superseded_by)}>its result</a>.</p>`}
     ${job.new_gains && html`<${Choice} key="choice" loop=${loop} detail=${detail} job=${job} latest=${latest} quiet=${quiet} onChanged=${onChanged} />`}
     ${job.monitoring && html`<${Watch} key="watch" loop=${loop} job=${job} onChanged=${onChanged} />`}
     ${!["fast", "setpoint"].includes(job.method) || own ? html`<div class="card" key="stages" style=${{ marginTop: "16px" }}><h2 class="title">Stages</h2>${Stages(job, loop.pv_unit)}</div>` : null}
