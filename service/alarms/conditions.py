@@ -30,8 +30,8 @@ _NEVER_HEARD_OF_T95 = 0.2
 """A loop that can be tuned is sampled at least fifty times a period: three samples take less than this part of T95."""
 _NO_ANSWER = (JobState.FAILED, JobState.INTERRUPTED)
 _BUS_ADVICE = (
-    "Check the interface and the cable. The bus is opened again every 2 s; controllers whose tests ran on it bring "
-    "their loops by themselves."
+    "Check the interface and the cable. The bus is opened again every 2 s; controllers whose tests ran on it "
+    "restore their loops by themselves."
 )
 _LISTENING_ADVICE = "It is started again by itself. Tests go on; what the loops do is not seen until then."
 _GATEWAY_ADVICE = f"{ADVICE[Reason.GATEWAY_LOST]} What alarms there are there is not known here meanwhile."

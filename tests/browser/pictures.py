@@ -127,6 +127,7 @@ def photograph(fleet: Fleet, camera: Photographer, jobs: dict[str, str], locked:
     drawn = "What the model leaves"
 
     def result(page: Page) -> None:
+        expect(person.present(page).locator(".big")).to_have_text(re.compile(r"\d"))
         expect(page.get_by_role("img", name=drawn)).to_be_visible()
         expect(page.get_by_role("slider", name="Ms")).to_be_enabled()
 
@@ -157,7 +158,7 @@ def photograph(fleet: Fleet, camera: Photographer, jobs: dict[str, str], locked:
         camera.take(name, f"/ui/loops/{RESULT}", result, size, palette)
     camera.take("refused", f"/ui{jobs[REFUSED]}", refused)
     camera.take("jobs", "/ui/jobs", lambda page: expect(page.get_by_role("row")).to_have_count(len(jobs) + 1), LOW)
-    camera.take("abnormal", "/ui/alarms", alarm, LOW)
+    camera.take("alarms", "/ui/alarms", alarm, LOW)
     camera.take("retune", f"/ui/loops/{UNTUNED}", asked, WITH_FORM)
     camera.take("batches", "/ui/batches", many, LOW)
     camera.take("log", "/ui/log", lambda page: expect(page.get_by_role("row").nth(len(jobs))).to_be_visible(), LOW)
