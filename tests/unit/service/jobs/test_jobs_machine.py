@@ -477,7 +477,7 @@ def test_jobs_do_what_the_model_says(
         run_state_machine_as_test(  # type: ignore[no-untyped-call]
             seed(number)(lambda: JobsMachine(tmp_path / FILE, machine_count)),
             settings=settings(
-                max_examples=30, stateful_step_count=40, database=None, deadline=None,
+                max_examples=20, stateful_step_count=40, database=None, deadline=None,
                 suppress_health_check=list(HealthCheck), print_blob=False,
             ),
         )  # fmt: skip
