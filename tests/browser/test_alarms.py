@@ -36,7 +36,7 @@ def test_a_plant_that_is_switched_off_in_a_test(site: Site, pages: Pages) -> Non
     lost = abnormal.get_by_role("row", name=re.compile(r"Node 10h \(16\) is lost: its heartbeat has stopped"))
     expect(lost.get_by_role("link", name=TAG)).to_be_visible()
     failed = abnormal.get_by_role("row", name=re.compile("The last test failed"))
-    expect(failed.get_by_role("link", name="the test")).to_have_attribute("href", f"/ui{job}")
+    expect(failed.get_by_role("link", name="the job")).to_have_attribute("href", f"/ui{job}")
     expect(abnormal).to_have_title("(2) Loopwright")
     expect(abnormal.get_by_role("link", name="2 active alarm")).to_be_visible()
     expect(lost.get_by_role("button")).to_have_count(0)
