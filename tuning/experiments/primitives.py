@@ -6,14 +6,18 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.tuning.experiments.what_moved import WhatMoved, what_moved
 from loopwright.tuning.gains import Gains
-from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, SetMode, SetOutput, SetSetpoint
+from loopwright.tuning.plan import Command, Event, Mode, Plan, Sample, SetMode, SetOutput, SetSetpoint, worked
 from loopwright.tuning.reasons import Reason, Refused
+
+T = TypeVar("T")
 
 Array = NDArray[np.float64]
 
@@ -220,7 +224,7 @@ def to_rest(facts: Facts, point: OperatingPoint, band: float, tested: Trace | No
                 if tested is None:
                     raise Refused(Reason.NOT_SELF_REGULATING, text)
                 tested.extend(trace)
-                raise held(facts, point, tested, text, Reason.NOT_SELF_REGULATING)
+                raise (yield from worked(held(facts, point, tested, text, Reason.NOT_SELF_REGULATING).search))
             raise Refused(Reason.NOT_AT_REST, f"{stayed}: the load has moved")
 
 
@@ -230,19 +234,46 @@ def what_moved_pv(facts: Facts, point: OperatingPoint, trace: Trace) -> WhatMove
     return what_moved(t, mv - point.mv, pv - point.pv, facts.T95_s, point.noise)
 
 
-def held(facts: Facts, point: OperatingPoint, trace: Trace, text: str, otherwise: Reason) -> Refused:
+class Unexplained(Refused):
+    """The refusal of a test that does not go on, before what has moved PV is looked for in its record, see `explained`.
+
+    search: finds the refusal by the whole of the record. It takes a second, while heartbeats have to go on.
+    """
+
+    def __init__(self, reason: Reason, text: str, search: Callable[[], Refused]) -> None:
+        super().__init__(reason, text)
+        self.search = search
+
+
+def held(
+    facts: Facts, point: OperatingPoint, trace: Trace, text: str, otherwise: Reason, load: Reason = Reason.STALLED
+) -> Unexplained:
     """The refusal of a test that does not go on, for a procedure to raise, by the whole of its record and not by its
     last moments: NO_RESPONSE, WRONG_SIGN, STALLED by a load disturbance, DISTURBED by a drift, or another reason.
 
     trace: from the first move of the test on. text: what has not come to pass.
-    otherwise: the reason where PV has answered MV, and nothing else has moved it.
+    otherwise: the reason where PV has answered MV, and nothing else has moved it. load: that of a load disturbance.
     """
+    return Unexplained(otherwise, text, partial(_by_whole_record, facts, point, trace, text, otherwise, load))
+
+
+def explained(plan: Plan[T]) -> Plan[T]:
+    """The plan, whose refusal as of `held` has the reason that the whole record gives."""
+    try:
+        return (yield from plan)
+    except Unexplained as unexplained:
+        raise (yield from worked(unexplained.search)) from None
+
+
+def _by_whole_record(
+    facts: Facts, point: OperatingPoint, trace: Trace, text: str, otherwise: Reason, load: Reason
+) -> Refused:
     found = what_moved_pv(facts, point, trace)
     reason = otherwise
     # a plant that integrates or runs away looks like one that a load or a drift moves: the words name that
     looks_alike = found.answered and otherwise is Reason.NOT_SELF_REGULATING
     if found.load and not looks_alike:
-        reason = Reason.STALLED
+        reason = load
     elif not found.answered:
         reason = Reason.NO_RESPONSE
     elif found.drift and not looks_alike:
@@ -252,7 +283,7 @@ def held(facts: Facts, point: OperatingPoint, trace: Trace, text: str, otherwise
     return Refused(reason, f"{text}; {found.in_words}")
 
 
-def no_oscillation(facts: Facts, point: OperatingPoint, trace: Trace, switches: int) -> Refused:
+def no_oscillation(facts: Facts, point: OperatingPoint, trace: Trace, switches: int) -> Unexplained:
     """The refusal of a relay test without a steady oscillation, for a procedure to raise, see `held`; CANNOT_OSCILLATE
     where nothing but MV has moved PV.
 

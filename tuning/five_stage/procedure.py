@@ -19,7 +19,7 @@ from typing import Literal, TypeVar
 from loopwright.tuning.analysis.comparison import Comparison, Predicted
 from loopwright.tuning.analysis.margins import Ultimate
 from loopwright.tuning.experiments.preflight import preflight
-from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, held, to_rest
+from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, explained, held, to_rest
 from loopwright.tuning.experiments.step_limits import not_kept
 from loopwright.tuning.experiments.step_test import StepResult, allowed_step, step_test
 from loopwright.tuning.experiments.verification import verification
@@ -224,7 +224,7 @@ def five_stage(facts: Facts, options: Options, finished: Finished = Finished()) 
         if found is not None:
             return found
         yield started(name)
-        result = yield from make()
+        result = yield from explained(make())
         yield (StageDone(name, result),)
         return result
 
@@ -331,7 +331,7 @@ def _baseline(facts: Facts, point: OperatingPoint, trace: Trace) -> Plan[StepRes
         )
     if not result.settled:
         text = f"PV has not settled within {result.duration_s:.3g} s of a set-point step of {step:.4g}"
-        found = held(facts, point, trace, text, Reason.NOT_SELF_REGULATING)
+        found = yield from worked(held(facts, point, trace, text, Reason.NOT_SELF_REGULATING).search)
         if found.reason is not Reason.NOT_SELF_REGULATING:
             raise found
     return result

@@ -286,8 +286,7 @@ class PulseTest(PulseExperiment):
                 f"{sample.pv - self.point.pv:+.3g} away for a set-point {sample.sp - self.point.sp:+.3g} away: a load "
                 "disturbance, or a fault of the plant, asks for more MV than is permitted"
             )
-            found = held(facts, self.point, self._tested(), text, Reason.MV_LIMIT)
-            raise Refused(Reason.MV_LIMIT, found.detail) if found.reason is Reason.STALLED else found
+            raise held(facts, self.point, self._tested(), text, Reason.MV_LIMIT, load=Reason.MV_LIMIT)
 
     def _fitting(self, gains: Gains) -> float:
         """The step of the set-point whose kick under these gains leaves room for MV, PV units."""

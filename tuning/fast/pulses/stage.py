@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 
+from loopwright.tuning.experiments.primitives import Unexplained
 from loopwright.tuning.experiments.ramp import slow_words
 from loopwright.tuning.fast.design.options import DesignOptions
 from loopwright.tuning.fast.evaluation.look import Look, look_at, or_a_pi, settled
@@ -108,10 +109,11 @@ def _first_pulses(test: PulseTest, relay_follows: bool) -> Plan[None]:
         yield from test.until_followed(longest_T95)
         yield from turn_down(test)
         yield from test.until_followed(longest_T95)
-    except Refused as refused:
-        if relay_follows and refused.reason in NOT_FOLLOWED:
-            raise TooLittleExcited(refused, test) from None
-        raise
+    except Unexplained as unexplained:
+        if not relay_follows:
+            raise
+        refused = yield from test.computed(unexplained.search)
+        raise TooLittleExcited(refused, test) if refused.reason in NOT_FOLLOWED else refused from None
     yield from turn_up(test)
 
 

@@ -10,13 +10,14 @@ import numpy as np
 
 from loopwright.tuning.analysis.pv_faults import pv_faults, without_wrong_samples
 from loopwright.tuning.analysis.window import SHOWS, oscillation_at_rest
+from loopwright.tuning.experiments.primitives import Unexplained
 from loopwright.tuning.fast.experiment import Experiment
 from loopwright.tuning.fast.record import ExperimentRecord
 from loopwright.tuning.fast.score_tests.mv_faults import find_mv_fault
 from loopwright.tuning.fast.structure_choice import choose_structure
 from loopwright.tuning.identification.output_error import Fit
 from loopwright.tuning.models import Reals
-from loopwright.tuning.plan import Plan
+from loopwright.tuning.plan import Plan, worked
 from loopwright.tuning.reasons import Reason, Refused
 
 T = TypeVar("T")
@@ -39,16 +40,17 @@ def naming_what_hides(test: Experiment, plan: Callable[[], Plan[T]]) -> Plan[T]:
     """The plan, whose refusal names what hides in the PV or in the MV of the test. Raises Refused as the plan."""
     try:
         return (yield from plan())
-    except Refused as refused:
+    except Refused as error:
+        refused = (yield from worked(error.search)) if isinstance(error, Unexplained) else error
         if refused.reason not in OF_THE_RECORD or type(refused) is not Refused:
-            raise
+            raise refused from None
         try:
             record = test.experiment_record()
         except Refused:
             raise refused from None
         rest = slice(0, test.listened)
         pv, mv_at_rest = np.asarray(test.trace.pv), float(np.mean(test.trace.mv[rest]))
-        raise (yield from test.computed(partial(with_what_hides, refused, record, pv, mv_at_rest))) from None
+        raise (yield from worked(partial(with_what_hides, refused, record, pv, mv_at_rest))) from None
 
 
 def while_open(test: Experiment, refused: Refused) -> str:

@@ -1,9 +1,15 @@
 """What has moved PV in a record, against records that are computed by the closed form of a first-order plant."""
 
+import pickle
+
 import numpy as np
 import pytest
 
+from loopwright.tuning.experiments.primitives import Facts, OperatingPoint, Trace, explained, held
 from loopwright.tuning.experiments.what_moved import WhatMoved, what_moved
+from loopwright.tuning.gains import Gains
+from loopwright.tuning.plan import Plan, Work
+from loopwright.tuning.reasons import Reason, Refused
 
 T95_S, NOISE = 100.0, 0.05
 K, T, L = 0.7, 25.0, 5.0
@@ -47,3 +53,20 @@ def test_an_answer_to_one_move_is_no_load() -> None:
 
 def test_a_pv_that_rests_has_not_answered() -> None:
     assert not found(HALF_WAVES, np.zeros(len(t))).answered
+
+
+def test_it_is_looked_for_beside_the_loop() -> None:
+    """A plan that computed it itself would keep the heartbeat from being sent meanwhile."""
+    facts, point = Facts(0.5, T95_S, 0.0, 100.0, 2.0, Gains(1.0, 30.0)), OperatingPoint(60.0, 60.0, 40.0, NOISE, 30.0)
+    pv = 60.0 - ANSWER + NOISE * np.random.default_rng(3).standard_normal(len(t))
+    trace = Trace(list(t), [60.0] * len(t), list(pv), list(40.0 + HALF_WAVES))
+
+    def plan() -> Plan[None]:
+        raise held(facts, point, trace, "it does not oscillate", Reason.STALLED)
+        yield ()
+
+    (work,) = next(explained(plan()))
+    assert isinstance(work, Work)
+    refused = pickle.loads(pickle.dumps(work.compute))()
+    assert type(refused) is Refused and refused.reason is Reason.WRONG_SIGN
+    assert "it does not oscillate" in refused.detail
