@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[4]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = {
     "service": (
-        "alembic", "dbos", "fastapi", "httpcore", "httpx", "jinja2", "prometheus_client", "psycopg", "can", "yaml",
+        "alembic", "dbos", "fastapi", "httpx", "jinja2", "prometheus_client", "psycopg", "can", "yaml",
         "sqlalchemy", "standardwebhooks", "uvicorn", "starlette",
     ),
     "plot": ("matplotlib",),

@@ -102,7 +102,7 @@ def test_a_loop_that_becomes_unstable_gets_its_old_gains_back(service: Service, 
     last = audit.trail(service.store.engine, 1)[0]
     assert (last.what, last.by, last.key) == ("rollback", "monitoring after acceptance", "service")
     (alarm,) = alarms(client, "rolled_back")
-    assert alarm["unacknowledged"] and "put back by the watch" in alarm["text"]
+    assert alarm["unacknowledged"] and "put back automatically" in alarm["text"]
     client.post(f"/alarms/{alarm['id']}/acknowledge", json={"by": "operator B"})
     alarms(client)
     here.goes_on(3.0)
