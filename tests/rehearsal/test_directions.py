@@ -99,8 +99,7 @@ def of_two_sided(
     return run(plan, RehearsedLoop(plant, channel, Ts), limits=RunLimits(max_time_s=3000.0))
 
 
-@pytest.mark.parametrize("directions", [Directions.BOTH, Directions.UP])
-@pytest.mark.parametrize("below", [0.7, 1.5])
+@pytest.mark.parametrize(("below", "directions"), [(0.7, Directions.UP), (1.5, Directions.BOTH)])
 def test_a_gain_that_differs_below_is_refused_where_MV_goes_there(below: float, directions: Directions) -> None:
     """On the way back these gains take MV below its rest."""
     assert of_two_sided(below, directions).value is None

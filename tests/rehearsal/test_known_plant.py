@@ -147,10 +147,10 @@ def test_new_gains_take_over_without_a_bump() -> None:
 @pytest.mark.parametrize(
     "changed",
     [
-        replace(LAG, K=2.0 * LAG.K), replace(LAG, K=0.5 * LAG.K), replace(LAG, K=1.25 * LAG.K),
+        replace(LAG, K=2.0 * LAG.K), replace(LAG, K=0.5 * LAG.K),
         replace(LAG, L=LAG.L + 1.1), replace(LAG, L=LAG.L + 3.0), replace(LAG, T=2.0 * LAG.T),
     ],
-    ids=["gain doubled", "gain halved", "gain x 1.25", "dead time 0.1 Pu longer", "0.3 Pu longer", "slower"],
+    ids=["gain doubled", "gain halved", "dead time 0.1 Pu longer", "0.3 Pu longer", "slower"],
 )  # fmt: skip
 def test_a_plant_that_has_changed_is_found_and_pulses_follow(changed: FOPDT) -> None:
     found = Retuned(changed, PI, heard_of(LAG, PI))

@@ -52,7 +52,7 @@ WITH_INPUT = [
 ]
 pytestmark = pytest.mark.timeout(600)  # each test is hundreds of requests
 WITH_KEYS = 200
-EACH = max(40, (int(os.environ.get("LOOPWRIGHT_FUZZ_CASES", "5000")) - WITH_KEYS) // (2 * len(WITH_INPUT)))
+EACH = max(40, (int(os.environ.get("LOOPWRIGHT_FUZZ_CASES", "2000")) - WITH_KEYS) // (2 * len(WITH_INPUT)))
 """Cases of an operation that the document allows, and as many that it forbids."""
 CHECKS = [
     not_a_server_error,
