@@ -28,7 +28,7 @@ def fleet(kind: str) -> None:
             check(f"both loops are shown at {door}", found == {TAG: "gateway-a", "TIC-201": "gateway-b"}, str(found))
         job = ask(f"/loops/{TAG}/retune", {"by": "gateway b"}, port=_DOOR_B)
         told = ended(job["url"], port=_DOOR_B)
-        tell(f"posted at B job on {TAG}, run by {told['host']}: {told['state']}")
+        tell(f"posted at B job on {TAG}, run by {told['gateway']}: {told['state']}")
         check("run by the gateway that has the bus", (told["gateway"], told["state"]) == ("gateway-a", "proposed"))
         expect("A's own log says so", logs("service"), f"job started, attempt 1 job={job['id']}")
         check("B's does not", f"job started, attempt 1 job={job['id']}" not in logs("service-b"), logs("service-b"))
