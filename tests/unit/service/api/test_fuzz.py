@@ -1,8 +1,7 @@
 """The OpenAPI document against the service: every operation, fed with what its schema allows and with what it forbids.
 
 No answer may be a 5xx, and none may be undocumented in status, media type, headers or shape. The examples are the same
-at every run; how many there were is in the run's summary. There are 5,000 of them, a minute or two for the processor;
-LOOPWRIGHT_FUZZ_CASES=50000 tries more.
+at every run; how many there were is in the run's summary. There are 2,000; LOOPWRIGHT_FUZZ_CASES=50000 tries more.
 """
 
 from __future__ import annotations
