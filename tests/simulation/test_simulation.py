@@ -1,4 +1,5 @@
-"""The simulation in `make test`: 100 seeds (`make simulate` has thousands), one job killed after each of its acts, and bugs that must be found."""
+"""The simulation in `make test`: 100 seeds (`make simulate` has thousands), one job killed after each of its acts, and
+bugs that must be found."""
 
 from __future__ import annotations
 
