@@ -107,7 +107,7 @@ def list_jobs(
 
 @app.command("batches")
 def list_batches(url: Url = DEFAULT_URL, as_json: AsJson = False) -> None:
-    """List the latest batches: batches."""
+    """List the latest batches."""
     from datetime import UTC, datetime
 
     from loopwright.service.cli import fleet_tables

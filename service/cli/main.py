@@ -493,10 +493,10 @@ def acknowledge(
         return
     jobs = parsed(AcknowledgedView, answer).jobs
     if jobs:
-        print(f"{loop}: you answer for it now. It is monitored for no test, and no false PV keeps a test from it.")
+        print(f"{loop}: you answer for it now; its restoration is not looked for any more, and a test may begin.")
         print(f"Acknowledged: {', '.join(jobs)}")
     else:
-        print(f"{loop}: there was nothing to acknowledge. It was not monitored, and no test has found its PV false.")
+        print(f"{loop}: there was nothing to acknowledge. Its restoration was confirmed, and no test found PV false.")
 
 
 app.command("methods")(tuning.methods)

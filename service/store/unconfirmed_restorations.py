@@ -21,7 +21,7 @@ from loopwright.service.store.tables import JobRow
 
 
 def rows(store: Store, loop: str | None = None) -> Sequence[Job]:
-    """The jobs of this host with a loop that is monitored, or those of one loop on whatever host; the latest
+    """The jobs of this host with a loop not confirmed as restored, or those of one loop on whatever host; the latest
     first."""
     mine = JobRow.host == store.host if loop is None else JobRow.loop == loop
     with store.reading() as session:
@@ -30,7 +30,7 @@ def rows(store: Store, loop: str | None = None) -> Sequence[Job]:
 
 
 def count(session: Session, host: str) -> int:
-    """How many loops of a host are monitored."""
+    """How many loops of a host are not confirmed as restored."""
     wanted = select(func.count(distinct(JobRow.loop))).where(JobRow.host == host, JobRow.restore_unconfirmed.is_(True))
     return session.scalar(wanted) or 0
 
@@ -50,8 +50,8 @@ def confirmed(store: Store, job_id: str, restored: Mapping[str, object], text: s
 
 
 def opened(job_id: str, columns: JobColumns) -> Write:
-    """The job has opened a session of its own: its loop is monitored for no other job. columns: what else is now
-    known of the job."""
+    """The job has opened a session of its own: the restoration after earlier jobs is not looked for any more. columns:
+    what else is now known of the job."""
     text = f"monitored no more: job {job_id} has opened a session on the loop"
 
     def write(session: Session) -> None:
@@ -66,8 +66,8 @@ def opened(job_id: str, columns: JobColumns) -> Write:
 
 
 def acknowledged(store: Store, loop: str, by: str) -> list[str]:
-    """A person answers for the loop. Returns the ids of the jobs it was monitored for, or that had found its PV to
-    be false."""
+    """A person answers for the loop. Returns the ids of the jobs after which it was not confirmed as restored, or that
+    had found its PV to be false."""
     with store.writing() as session:
         false = false_pv.not_acknowledged(session, loop, lock=True)
         found = {row.id: row for row in (*_of_loop(session, loop), *false)}
