@@ -15,7 +15,7 @@ from loopwright.service.api.aborts import BODY, SaidBy
 from loopwright.service.api.bodies import signed_test
 from loopwright.service.api.job_views import JobView, LoopView, loop_view
 from loopwright.service.api.paging import LINK, Cursor, JobLimit, Limit, listed, more
-from loopwright.service.api.routes import add, new_router
+from loopwright.service.api.routes import Tag, add, new_router
 from loopwright.service.jobs.fleet import BadFleet, Fleet, FleetRequest
 from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.listening import Listening
@@ -29,7 +29,6 @@ from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Reason
 
 BatchId = Annotated[str, Path(description="Id of the retune", examples=["9d1b7c02aa45"])]
-Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 LoopFilter = Literal["busy", "idle"] | JobState
 
 

@@ -7,13 +7,13 @@ import asyncio
 from typing import Annotated
 
 import numpy as np
-from fastapi import APIRouter, Path, Query
+from fastapi import APIRouter, Query
 from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, Field
 
 from loopwright.protocol.profile import Mode
 from loopwright.service.api import problems
-from loopwright.service.api.routes import new_router
+from loopwright.service.api.routes import JobId, new_router
 from loopwright.service.errors import Conflict, Stopping
 from loopwright.service.execution.computing.pool import NotWanted
 from loopwright.service.jobs.alternatives import designable
@@ -25,7 +25,6 @@ from loopwright.service.jobs.manager import Jobs
 from loopwright.service.listening.bins import GAP_BEFORE, Bins, decimals
 from loopwright.service.store.jobs import Job
 
-JobId = Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])]
 _SINCE = "plant time since the first sample, s"
 
 

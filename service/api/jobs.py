@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Body, Header, Path, Query, Response
+from fastapi import APIRouter, Body, Header, Query, Response
 from fastapi.responses import StreamingResponse
 
 from loopwright.service.api import problems
@@ -13,7 +13,7 @@ from loopwright.service.api.event_views import STREAMED_EVENT, StoredEventView, 
 from loopwright.service.api.events import event_stream, still_permitted
 from loopwright.service.api.job_views import AcceptDecision, Decision, JobView, SamplesView, signed_by
 from loopwright.service.api.paging import LARGEST, LINK, Cursor, Limit, more
-from loopwright.service.api.routes import new_router
+from loopwright.service.api.routes import JobId, new_router
 from loopwright.service.api.samples import Reading, csv_text, json_text, parts
 from loopwright.service.api.services import Services
 from loopwright.service.api.shown_jobs import ShownJobs
@@ -22,7 +22,6 @@ from loopwright.service.security.principal import current
 from loopwright.service.states.job_state import ACTIVE, JobState
 from loopwright.service.store.jobs import Job
 
-JobId = Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])]
 _NOT_YET: problems.Responses = {
     202: {
         "model": JobView,

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Path
+from fastapi import APIRouter, Body
 from pydantic import BaseModel, Field
 
 from loopwright.service.api import problems
 from loopwright.service.api.job_views import Decision, LockView, signed_by
-from loopwright.service.api.routes import new_router
+from loopwright.service.api.routes import Tag, new_router
 from loopwright.service.inputs.validation import ONE_LINE, STRICT
 from loopwright.service.jobs.locking import Locking
 from loopwright.service.security.principal import signed
-
-Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 
 
 class LockWish(BaseModel):

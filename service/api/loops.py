@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Path, Request, Response
+from fastapi import APIRouter, Body, Request, Response
 
 from loopwright.service.api import gateways, problems
 from loopwright.service.api.bodies import signed_test
@@ -21,7 +21,7 @@ from loopwright.service.api.job_views import (
     loop_view,
     signed_by,
 )
-from loopwright.service.api.routes import new_router
+from loopwright.service.api.routes import Tag, new_router
 from loopwright.service.api.services import Services
 from loopwright.service.api.shown_jobs import ShownJobs
 from loopwright.service.api.watch_views import MonitoringView
@@ -33,8 +33,6 @@ from loopwright.service.states.loop_state import LoopState
 from loopwright.service.store import watches
 from loopwright.service.store.live_jobs import acceptances, latest_jobs
 from loopwright.tuning.reasons import Ended
-
-Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 
 
 def router(services: Services, readings: SharedReading[LoopState | None], shown: ShownJobs) -> APIRouter:

@@ -7,10 +7,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Path, Query
+from fastapi import APIRouter, Body, Query
 
 from loopwright.service.api import problems
-from loopwright.service.api.routes import new_router
+from loopwright.service.api.routes import Tag, new_router
 from loopwright.service.execution.computing.limits import ComputationKind
 from loopwright.service.execution.computing.pool import NotWanted, Pool
 from loopwright.service.execution.procedures import expected
@@ -28,8 +28,6 @@ from loopwright.service.store.jobs import Job
 from loopwright.tuning.reasons import Ended, Failed
 
 log = logging.getLogger(__name__)
-
-Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
 
 
 def router(jobs: Jobs, fleet: Fleet, pool: Pool) -> APIRouter:

@@ -12,10 +12,10 @@ from fastapi.responses import HTMLResponse
 
 from loopwright.service.api import problems
 from loopwright.service.api.computed import computed
-from loopwright.service.api.job_figures import JobId, figures_of
+from loopwright.service.api.job_figures import figures_of
 from loopwright.service.api.job_views import JobView
 from loopwright.service.api.report.paper import POLICY, ReportSource, paper
-from loopwright.service.api.routes import new_router
+from loopwright.service.api.routes import JobId, new_router
 from loopwright.service.errors import UnknownLoop
 from loopwright.service.execution.computing.pool import Pool
 from loopwright.service.inputs.config import LoopConfig

@@ -6,10 +6,15 @@ for the routes of this service.
 
 from __future__ import annotations
 
-from fastapi import APIRouter, FastAPI
+from typing import Annotated
+
+from fastapi import APIRouter, FastAPI, Path
 from fastapi.routing import APIRoute
 
 from loopwright.service.api.bodies import JsonRoute
+
+Tag = Annotated[str, Path(description="Tag of the loop", examples=["TIC-101"])]
+JobId = Annotated[str, Path(description="Id of the job", examples=["4f0c2a9be113"])]
 
 
 def name_of(route: APIRoute) -> str:
