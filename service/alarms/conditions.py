@@ -185,9 +185,8 @@ def _tests(known: AlarmFacts) -> Iterator[Condition]:
     for test in known.tests:
         if test.state not in _NO_ANSWER or test.id in unconfirmed:
             continue
-        if not known.acknowledged.isdisjoint(
-            _of_the_end(test.id)
-        ):  # whoever acknowledged that has seen how the test ended
+        # whoever acknowledged that has seen how the test ended
+        if not known.acknowledged.isdisjoint(_of_the_end(test.id)):
             continue
         how = "failed" if test.state is JobState.FAILED else "was interrupted"
         why = "" if test.reason is None else f": {str(test.reason).replace('_', ' ')}"

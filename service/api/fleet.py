@@ -28,7 +28,7 @@ from loopwright.service.store.tables import BatchRow
 from loopwright.tuning.gains import Gains
 from loopwright.tuning.reasons import Reason
 
-BatchId = Annotated[str, Path(description="Id of the retune", examples=["9d1b7c02aa45"])]
+BatchId = Annotated[str, Path(description="Id of the batch", examples=["9d1b7c02aa45"])]
 LoopFilter = Literal["busy", "idle"] | JobState
 
 
@@ -58,7 +58,7 @@ class BatchSummary(BaseModel):
         "skipped; stopped: by failures or with the service; aborted: by an operator",
         examples=["running"],
     )
-    gateway: str = Field(description="Name of the gateway that runs the retune", examples=["local"])
+    gateway: str = Field(description="Name of the gateway that runs the batch", examples=["local"])
     by: str = Field(examples=["night shift"])
     created_at: str = Field(description="UTC, ISO 8601, wall time", examples=["2026-01-31T12:00:00.000Z"])
     ended_at: str | None = Field(description="UTC, ISO 8601, wall time")
